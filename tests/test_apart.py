@@ -5,6 +5,7 @@ import signal
 import numpy as np
 import pytest
 
+from surgisoft import apart
 from surgisoft.apart import read_apart, started, unpacked
 from surgisoft.errors import InputError
 from tests import aborting
@@ -43,9 +44,10 @@ def test_every_end_is_one_line(tmp_path, way, said):
 
 
 def test_a_reader_without_end_is_ended(tmp_path):
-    """Processor time is limited by the size of the file: 4 s for a small one."""
+    """Processor time is limited by the size of the file: 4 s for a small one, here 0.5 s."""
     path = tmp_path / "a.txt"
     path.write_text("endless")
+    assert apart.PATIENCE_S == 4.0
     with pytest.raises(InputError, match=f"status -{signal.SIGXCPU.value}"):
         read(path)
 

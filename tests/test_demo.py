@@ -1,6 +1,7 @@
 """The demonstration: five steps, each with its result on the page and its files."""
 
 import base64
+from types import SimpleNamespace
 
 import pytest
 from PIL import Image
@@ -9,6 +10,7 @@ from surgisoft.cli import run
 from surgisoft.demonstration import story
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import load_recordings
+from surgisoft.report import Text
 from surgisoft.surrogate.checkpoint import load_model
 
 
@@ -29,7 +31,8 @@ def test_five_steps_with_their_pictures(tmp_path, monkeypatch, capsys):
     folder = tmp_path / "story"
     assert run(["demo", "-o", str(folder)]) == 0
     said = capsys.readouterr().out
-    assert [line[:2] for line in said.splitlines()[:5]] == ["1.", "2.", "3.", "4.", "5."]
+    steps = [line for line in said.splitlines() if line[:1].isdigit()]
+    assert [line[:2] for line in steps] == ["1.", "2.", "3.", "4.", "5."]
     assert "1. cut: the whole ring was cut in" in said
     assert f"wrote {folder / 'index.html'}" in said
     (recording,) = load_recordings(folder / "bench.parquet")
@@ -52,3 +55,33 @@ def test_a_folder_that_cannot_be_made_is_one_line(tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(InputError, match="cannot be written"):
         story.demo(tmp_path / "file" / "inside")
+
+
+@pytest.mark.parametrize("failing", ["replay", "recording"])
+def test_what_ends_early_leaves_whole_steps_or_nothing(tmp_path, monkeypatch, failing):
+    """The page shows the steps so far: none where the cut fails, one where the recording does."""
+    folder, steps = tmp_path / "story", []
+
+    def none(*_, **__):
+        raise InputError("no replay")
+
+    log, parts = object(), [Text("the cut"), Text("left out")]
+    cut = SimpleNamespace(logs={"ring": log})
+    monkeypatch.setattr(story, "evaluate", lambda *_, **__: cut)
+    monkeypatch.setattr(story, "_cut_sentence", lambda cut: "the whole ring was cut")
+    monkeypatch.setattr(story, "episode_parts", lambda log: parts)
+    monkeypatch.setattr(story, "open_replay", none)
+    monkeypatch.setattr(story, "write_replay", none if failing == "replay" else lambda *_: None)
+    monkeypatch.setattr(story, "HIDDEN", "nonsense")
+    with pytest.raises(InputError, match="no replay" if failing == "replay" else "nonsense"):
+        story.demo(folder, on_step=lambda name, text: steps.append(name))
+    if failing == "replay":
+        assert not folder.exists()
+        assert not steps
+        return
+    assert steps == ["cut"]
+    assert [path.name for path in folder.iterdir()] == ["index.html"]
+    page = (folder / "index.html").read_text()
+    assert page.count("<section") == 1
+    assert "4 steps follow" in page
+    assert "the cut" in page

@@ -52,12 +52,21 @@ def test_python_blocks_are_python(page):
         ast.parse(re.sub(r"^ {3}", "", block, flags=re.M) if block.startswith("   ") else block)
 
 
-def test_the_readme_names_every_command():
+@pytest.mark.parametrize("page", ["README.md", "docs/commands.md"])
+def test_the_readme_and_the_list_name_every_command(page):
     for module in COMMANDS:
         __import__(f"surgisoft.cli.{module}")
-    table = (ROOT / "README.md").read_text()
+    text = (ROOT / page).read_text()
     for name in get_command(app).commands:
-        assert f"`surgisoft {name}" in table, name
+        assert f"`surgisoft {name}" in text, name
+
+
+def test_the_readme_is_short():
+    """Below 150 lines, one picture, one table: what a newcomer reads first."""
+    text = without_code((ROOT / "README.md").read_text())
+    assert len((ROOT / "README.md").read_text().splitlines()) < 150
+    assert text.count("![") == 1
+    assert len(re.findall(r"^\|[-|: ]+\|$", text, re.M)) == 1
 
 
 def test_the_site_has_every_page():

@@ -84,12 +84,18 @@ def test_ctrl_c_does_not_reach_a_worker_that_starts():
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
-def spent_by_other_threads() -> float:
-    """Processor time, s, that threads other than this one spend on products of matrices."""
+def spent_by_other_threads() -> list[float]:
+    """Processor time, s, that other threads spend on each of five products of matrices.
+
+    Some of it is spent by threads that take no part, such as that of the test runner.
+    """
     square = np.ones((1200, 1200))
-    before = time.process_time() - time.thread_time()
-    _ = square @ square
-    return time.process_time() - time.thread_time() - before
+    spent = []
+    for _ in range(5):
+        before = time.process_time() - time.thread_time()
+        np.matmul(square, square)
+        spent.append(time.process_time() - time.thread_time() - before)
+    return spent
 
 
 @pytest.mark.skipif(
@@ -98,8 +104,8 @@ def spent_by_other_threads() -> float:
 )
 def test_a_block_of_one_thread_holds_for_products_of_numpy_too():
     with torch_threads(2):
-        assert spent_by_other_threads() > 0.002
+        assert max(spent_by_other_threads()) > 0.002
         with torch_threads(1):
             time.sleep(0.1)  # idle threads of OpenBLAS spin for a moment before they sleep
-            assert spent_by_other_threads() < 0.001
-        assert spent_by_other_threads() > 0.002
+            assert min(spent_by_other_threads()) < 0.001
+        assert max(spent_by_other_threads()) > 0.002

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
+import numpy as np
 import torch
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 from torch import Tensor, nn
 
 from surgisoft.agents.presets import Preset
+from surgisoft.compiled import compiled
 
 
 def network_config(preset: Preset) -> dict:
-    """rsl-rl's arguments of an actor or critic; fresh each time, for rsl-rl writes into them."""
+    """rsl-rl's arguments of an actor or critic: a new dict each time, because rsl-rl changes it."""
     return {
         "hidden_dims": list(preset.hidden),
         "activation": preset.activation,
@@ -30,7 +35,7 @@ def noise_config(preset: Preset) -> dict:
 
 
 def empty_actor(agent: str, width: int, chambers: int, preset: Preset) -> MLPModel:
-    """An actor without its weights: (B, width) observations in, (B, chambers) outputs out."""
+    """An untrained actor: (B, width) observations in, (B, chambers) outputs out."""
     seen = TensorDict({agent: torch.zeros(1, width)}, batch_size=[1])
     config = {**network_config(preset), "distribution_cfg": noise_config(preset)}
     return MLPModel(seen, {"actor": [agent]}, "actor", chambers, **config)
@@ -43,7 +48,89 @@ class ScaledActor(nn.Module):
         """Scale an actor: action_kPa per output of 1, clipped to the pumps' limit step_kPa."""
         super().__init__()
         self.network, self.scale, self.limit = actor.as_jit(), action_kPa, step_kPa
+        # What is evaluated is what a saved policy computes, to the last bit.
+        _exchange_activations(self.network.mlp, CompiledTanh, nn.Tanh)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Actions (B, m) kPa, within the limits of the pumps, from observations (B, D)."""
         return (self.scale * self.network(observation)).clamp(-self.limit, self.limit)
+
+
+# The hyperbolic tangent ----------------------------------------------------------------------
+
+PADE = 12
+"""Order of the Pade approximant of exp(2 x) that the compiled tanh takes: within 5e-8 of tanh up
+to `SATURATED`, which is less than the rounding of float32 there."""
+SATURATED = np.float32(9.2)
+"""Argument beyond which tanh is 1 in float32."""
+_TERMS = [
+    math.comb(PADE, k) * math.factorial(2 * PADE - k) * 2.0**k / math.factorial(2 * PADE)
+    for k in range(PADE + 1)
+]
+ODD = np.array(_TERMS[1::2][::-1], np.float32)
+EVEN = np.array(_TERMS[0::2][::-1], np.float32)
+"""Terms of odd and of even powers of the approximant's numerator, the highest first: with N(x) its
+numerator exp(2 x) is N(x) / N(-x) and tanh x is N's odd part over its even part (Pade 1892)."""
+
+
+@compiled
+def _tanh(x, out):
+    """tanh of x (N,) into out (N,)."""
+    for i in range(len(x)):
+        value = x[i]
+        value = SATURATED if value > SATURATED else value
+        value = -SATURATED if value < -SATURATED else value
+        square = value * value
+        above, below = ODD[0], EVEN[0]
+        for k in range(1, len(ODD)):
+            above = above * square + ODD[k]
+        for k in range(1, len(EVEN)):
+            below = below * square + EVEN[k]
+        out[i] = value * above / below
+
+
+def _compiled_tanh(x: Tensor) -> Tensor:
+    x = x.detach().contiguous()
+    out = torch.empty_like(x)
+    _tanh(x.view(-1).numpy(), out.view(-1).numpy())
+    return out
+
+
+class _TanhFunction(torch.autograd.Function):
+    """tanh with the derivative 1 - tanh^2."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        out = _compiled_tanh(x)
+        ctx.save_for_backward(out)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        return torch.ops.aten.tanh_backward(gradients[0], ctx.saved_tensors[0])
+
+
+class CompiledTanh(nn.Tanh):
+    """tanh on a processor in a tenth of PyTorch's time, which was a fifth of an update of PPO.
+
+    Within 1e-6 of tanh. Elsewhere, and in other types than float32, it is PyTorch's own.
+    """
+
+    def forward(self, input: Tensor) -> Tensor:  # noqa: A002  # nn.Tanh names it so
+        """(...) tanh of (...)."""
+        if input.device.type != "cpu" or input.dtype != torch.float32:
+            return super().forward(input)
+        if torch.is_grad_enabled() and input.requires_grad:
+            return _TanhFunction.apply(input)
+        return _compiled_tanh(input)
+
+
+def compile_activations(network: MLPModel) -> None:
+    """Let an actor or critic that is trained on a processor compute tanh by `CompiledTanh`."""
+    _exchange_activations(network.mlp, nn.Tanh, CompiledTanh)
+
+
+def _exchange_activations(layers: nn.Sequential, old: type[nn.Module], new: type[nn.Tanh]) -> None:
+    for place, layer in enumerate(layers):
+        if type(layer) is old:
+            layers[place] = new()

@@ -24,7 +24,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from surgisoft.agents.distributed import Processes
-from surgisoft.agents.policy_network import network_config, noise_config
+from surgisoft.agents.policy_network import compile_activations, network_config, noise_config
 from surgisoft.agents.presets import Preset
 from surgisoft.agents.vec_env import STATE, JointEnv
 
@@ -82,6 +82,8 @@ def make_ppo(env: JointEnv, preset: Preset, processes: Processes) -> dict[str, P
             # Before it has learned anything a policy asks for next to nothing.
             ppo.get_policy().mlp[-1].weight.mul_(0.01)
             ppo.get_policy().mlp[-1].bias.zero_()
+        for network in (ppo.actor, ppo.critic):
+            compile_activations(network)
         for group in ppo.optimizer.param_groups:
             # One call for all weights instead of a dozen small ones for each.
             group["fused"] = True

@@ -43,6 +43,7 @@ def evaluation_page(
     ]
     header = ["mean [95 % interval]", *(Path(result.policy).name for result in results)]
     best = next(iter(results))
+    several = len(results) > 1 or any(len(rows) > 1 for rows in best.per_episode.values())
     return Page(
         title=f"Evaluation of {task}, {on}",
         verdict=verdict(task, results),
@@ -51,7 +52,7 @@ def evaluation_page(
         parts=[
             Facts(_facts(best)),
             Section("All numbers", [Table(header, rows)]),
-            Section("Every episode", [Gallery(_spreads(results))]),
+            *([Section("Every episode", [Gallery(_spreads(results))])] if several else []),
             *(
                 Section(
                     f"First episode of {Path(name).name}",

@@ -220,7 +220,8 @@ def dose_map(log: EpisodeLog) -> Picture | None:
         return chart(
             figure,
             "dose on the organ",
-            f"Solid: the lesion. Dashed: healthy tissue begins. Treated from {least:.3g} on",
+            "Solid: the lesion. Dashed: healthy tissue begins. Treated from "
+            f"{least:.3g} times the threshold of ablation on",
         )
 
 
@@ -242,8 +243,12 @@ def spread_chart(
                 axis.plot([values.mean()] * 2, [place - 0.3, place + 0.3], c=RED, lw=2)
         axis.set_yticks(range(len(known)), [name for name, _ in known])
         axis.set_ylim(len(known) - 0.5, -0.5)
+        every = np.concatenate([values for _, values in known])
+        if "[" not in label and every.min() >= 0.0 and every.max() <= 1.0:  # a share
+            axis.set_xlim(-0.02, 1.02)
         axis.set_xlabel(label)
-        axis.set_title(title)
+        if title != label:
+            axis.set_title(title)
         return chart(figure, title, "One dot per episode; red: the mean")
 
 
@@ -264,20 +269,42 @@ def broken_at_jumps(points: np.ndarray) -> np.ndarray:
     return np.insert(points, np.flatnonzero(jump) + 1, np.nan, axis=0)
 
 
+UNORDERED = ("chamber", "specimen")
+"""Fields of an experiment whose numbers are names: nothing lies between two of them."""
+BESIDE = 0.12
+"""Distance of the marks of two lines at the same value of such a field."""
+
+
 def sweep_chart(field: str, label: str, lines: Mapping[str, Sequence[tuple]]) -> Picture:
-    """A number over what varies, with 95 % intervals; lines: name -> (value, mean, low, high)."""
+    """A number over what varies, with 95 % intervals; lines: name -> (value, mean, low, high).
+
+    Between the values of `UNORDERED` fields no line is drawn.
+    """
     colours = (BLUE, RED, GREEN, AMBER)
     name = field.split(".")[-1]
+    apart, most = name in UNORDERED, 0.0
+    known: set[float] = set()
     with drawing():
         figure, axis = plt.subplots()
-        for (title, points), colour in zip(lines.items(), colours * len(lines), strict=False):
+        for k, ((title, points), colour) in enumerate(
+            zip(lines.items(), colours * len(lines), strict=False)
+        ):
             x, mean, low, high = np.array(points, dtype=float).T
+            most, known = max(most, np.nanmax(np.append(high, mean))), known | set(x.tolist())
+            if apart:
+                beside = x + BESIDE * (k - 0.5 * (len(lines) - 1))
+                spread = np.abs(np.stack((low, high)) - mean)
+                axis.errorbar(beside, mean, spread, c=colour, fmt="o", ms=5, lw=1.5, label=title)
+                continue
             axis.fill_between(x, low, high, color=colour, alpha=0.15, lw=0)
             axis.plot(x, mean, c=colour, marker="o", ms=4, label=title)
-        axis.set_ylim(bottom=0)
+        if apart:
+            axis.set_xticks(sorted(known))
+        axis.set_ylim(0.0, 1.06 * most if most > 0.0 else 1.0)
         axis.set_xlabel(name)
         axis.set_ylabel(label)
         axis.set_title(f"{label} over {name}")
         if len(lines) > 1:
             axis.legend()
-        return chart(figure, f"{label} over {name}", "Shaded: 95 % interval of the mean")
+        band = "Lines" if apart else "Shaded"
+        return chart(figure, f"{label} over {name}", f"{band}: 95 % interval of the mean")

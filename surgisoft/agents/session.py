@@ -23,11 +23,11 @@ from surgisoft.scene.folder import Scene, open_scene
 from surgisoft.tasks.base import Episodes, Task
 from surgisoft.tasks.episodes.log import EpisodeLog
 from surgisoft.tasks.registry import (
-    TASKS,
     config_of,
     make_task,
     read_config,
     spec_of,
+    task_names,
     with_fields,
 )
 
@@ -107,7 +107,7 @@ class EvaluationRequest:
             check_policy(name)
         runs = [RunFolder(name) for name in self.policies if name not in POLICIES]
         if self.task is None and not runs:
-            raise InputError(f"--task is missing; expected one of {', '.join(sorted(TASKS))}")
+            raise InputError(f"--task is missing; expected one of {', '.join(task_names())}")
         task = self.task or runs[0].config["task"]
         brought = [run for run in runs if run.config["task"] == task]
         for run in runs:

@@ -17,7 +17,7 @@ from surgisoft.agents.session import task_config
 from surgisoft.agents.training import Result, TrainingProgress, resume, train_new
 from surgisoft.config import COMMAND_LINE, Where, from_table, merged, to_table
 from surgisoft.errors import InputError
-from surgisoft.tasks.registry import TASKS, changed_config
+from surgisoft.tasks.registry import changed_config, task_names
 from surgisoft.workers import torch_threads
 
 
@@ -129,7 +129,7 @@ def train(
             raise InputError(f"--resume continues with the options of the run: leave out {given}")
         plan, folder = None, Path(resume_from)
     elif task is None:
-        raise InputError(f"--task is missing: one of {', '.join(sorted(TASKS))}, or --resume RUN")
+        raise InputError(f"--task is missing: one of {', '.join(task_names())}, or --resume RUN")
     else:
         plan = TrainingRequest(task, **fields).plan()
         folder = _new_folder(task, output)

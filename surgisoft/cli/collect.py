@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -231,9 +232,16 @@ def checked_by(model: Path) -> Callable[[Rig], None]:
     return check
 
 
+LONG_S = 120.0
+"""Time on the bench from which it is stated in minutes, s."""
+
+
 def written_line(path: Path, recording: Recording, hidden: Sequence[Sequence] = ()) -> str:
     """One line about a recording that was written."""
-    minutes = recording.t_s[-1] / 60
+    # the clock of a rig may begin anew with each run
+    times_s = recording.t_s.tolist()
+    bench_s = times_s[0] + sum(max(b - a, 0.0) for a, b in pairwise(times_s))
+    time = f"{bench_s / 60:.0f} min" if bench_s >= LONG_S else f"{bench_s:.0f} s"
     noise = "" if recording.noise_mm is None else f", noise {recording.noise_mm:.3f} mm"
     secret = "".join(
         f", hidden {name} {size:g}" + "".join(f" from {begins_s:g} s on" for begins_s in late)
@@ -242,7 +250,7 @@ def written_line(path: Path, recording: Recording, hidden: Sequence[Sequence] = 
     return (
         f"wrote {path}: {recording.samples} {recording.kind} samples of {recording.chambers} "
         f"chambers and {recording.key_points} key points in {len(recording.runs)} runs, "
-        f"{minutes:.0f} min on the bench{noise}{secret}"
+        f"{time} on the bench{noise}{secret}"
     )
 
 

@@ -1,5 +1,6 @@
 """`surgisoft demo`: the package's story in five steps, with pictures."""
 
+from itertools import count
 from pathlib import Path
 from typing import Annotated
 
@@ -18,14 +19,22 @@ def demo(
 ) -> None:
     """Show what the package does: two arms cut a ring; a model's missing effect is found.
 
-    Takes about a minute and needs no data. The first run compiles for half a minute more.
+    Needs no data. The page index.html in DIR is there after the first step and grows with each.
     """
     from surgisoft.demonstration import demo as run_demo
 
+    steps = count(1)
+
+    def show(name: str, sentence: str) -> None:
+        number = next(steps)
+        print(f"{number}. {name}: {sentence}", flush=True)
+        if number == 1:
+            print(
+                f"   its picture: {output / 'index.html'}, which grows with each step", flush=True
+            )
+
     with progress("demo") as report:
-        result = run_demo(output, progress=report)
-    for number, (name, text) in enumerate(result.sentences.items(), 1):
-        print(f"{number}. {name}: {text}")
+        result = run_demo(output, progress=report, on_step=show)
     if result.no_picture:
         print(f"no picture of the replay: {result.no_picture}")
     show_written([result.page, output / "cut.rrd"])

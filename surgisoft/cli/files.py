@@ -1,6 +1,7 @@
 """Output paths: checks before a command spends its time, and lines about what was written."""
 
 import os
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -56,17 +57,30 @@ def check_replay(path: Path | None) -> None:
     check_folder(path.absolute().parent)
 
 
+MANY_PICTURES = 4
+"""Number of pictures in a folder beyond which the folder is named in their place."""
+PICTURES = (".png", ".svg")
+"""Suffixes of pictures."""
+
+
 def show_written(paths: Iterable[object]) -> None:
     """Print each file that was written, and how to look at it where that is not plain.
 
-    Of several pages only the first one is to be opened; the others belong to it.
+    Of several pages only the first one is to be opened; the others belong to it. Many pictures of a
+    folder are one line.
     """
+    given = [(path, Path(getattr(path, "path", str(path)))) for path in paths]
+    pictures = Counter(file.parent for _, file in given if file.suffix in PICTURES)
     shown = False
-    for path in paths:
-        file = Path(getattr(path, "path", str(path)))
+    for path, file in given:
+        if file.suffix in PICTURES and pictures[file.parent] > MANY_PICTURES:
+            continue
         pages_follow = file.suffix == ".html" and shown
         shown = shown or file.suffix == ".html"
         print(f"wrote {path}{'' if pages_follow else _how_to_look(file)}")
+    for folder, count in pictures.items():
+        if count > MANY_PICTURES:
+            print(f"wrote {count} pictures to {folder}")
 
 
 def _how_to_look(path: Path) -> str:

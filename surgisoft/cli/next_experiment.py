@@ -103,28 +103,40 @@ def next_experiment(
     if json_file:
         write_json(json_file, result.to_json())
     later = [*(predictions or []), Path("PREDICTIONS_OF_NEW.csv")] if predictions else None
-    _show(result, model, recordings or [], output, model_options(later, model_error))
+    _show(result, model, recordings or [], output, rig, record, model_options(later, model_error))
     if record:
         _record(result, rig, output, record, force)
 
 
-def _show(result, model: Path, recordings: list[Path], output: Path, of_model: str) -> None:
+def _show(
+    result,
+    model: Path,
+    recordings: list[Path],
+    output: Path,
+    rig: str,
+    record: Path | None,
+    of_model: str,
+) -> None:
     from surgisoft.diagnosis.design.isolability import SURE
 
     print(f"next experiment: {result.name}, {result.minutes:g} min on the bench")
     print(f"why: {result.why}")
     for number, step in enumerate(result.steps, 1):
         print(f"  {number}. {step}")
-    on_rig = (result.protocol.commands.shape[1], result.protocol.unit) == ON_RIG
-    if result.by_hand and on_rig:
-        print("  the virtual rig has no option for that change: --as-it-stands asks for none")
-    elif on_rig:
+    new, other = record or Path("NEW.parquet"), rig.partition(":")[0] != "virtual"
+    if other and not record:
+        print(f"  on the rig: surgisoft collect {output} --rig {rig} -o {new}")
+    elif not other and (result.protocol.commands.shape[1], result.protocol.unit) == ON_RIG:
         options = f" {result.options}" if result.options else ""
-        print(f"  on the virtual rig: surgisoft collect {output}{options} -o NEW.parquet")
+        place = "" if rig == "virtual" else f" --rig {rig}"
+        if result.by_hand:
+            print("  the virtual rig has no option for that change: --as-it-stands asks for none")
+        elif not record:
+            print(f"  on the virtual rig: surgisoft collect {output}{place}{options} -o {new}")
     # After a change that removes an effect, only the new recording counts.
     old = "" if result.by_hand else "".join(f" {path}" for path in recordings)
     taken = f" --without {' '.join(result.removes)}" if result.by_hand else ""
-    print(f"  then: surgisoft diagnose {model}{old} NEW.parquet{taken}{of_model}")
+    print(f"  then: surgisoft diagnose {model}{old} {new}{taken}{of_model}")
     pairs = sorted(result.pairs, key=lambda pair: pair.after)
     open_ = [pair for pair in pairs if pair.effects not in result.separates]
     shown = max(SHOWN_PAIRS, len(open_))

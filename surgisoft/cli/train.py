@@ -31,16 +31,20 @@ def _complete(context: typer.Context, incomplete: str) -> list[str]:
     """Fields that begin so, of the task that the line names so far."""
     from surgisoft.agents.presets import Preset
     from surgisoft.config import field_names
-    from surgisoft.tasks.registry import TASKS
+    from surgisoft.tasks.registry import config_of, task_names
 
     if incomplete.startswith("task="):
-        return [name for name in (f"task={each}" for each in TASKS) if name.startswith(incomplete)]
+        return [
+            name
+            for name in (f"task={each}" for each in task_names())
+            if name.startswith(incomplete)
+        ]
     words = context.params.get("changes") or []
     named = [word.removeprefix("task=") for word in words if word.startswith("task=")]
     task: str | None = context.params.get("task") or (named[-1] if named else None)
     fields = [*OPTIONS, *(f"ppo.{name}" for name in field_names(Preset()))]
-    if task is not None and task in TASKS:
-        fields += field_names(TASKS[task].config)
+    if task is not None and task in task_names():
+        fields += field_names(config_of(task))
     return [f"{name}=" for name in fields if name.startswith(incomplete)]
 
 

@@ -167,7 +167,7 @@ def _error_chart(points: tuple[PointError, ...]) -> Picture:
     axis.set_xticks(range(len(some)), [each.label for each in some])
     axis.set_ylim(bottom=0)
     axis.set_ylabel("[mm]")
-    axis.legend(fontsize=7)
+    figure.legend(loc="outside lower center", ncols=2, fontsize=8)
     axis.set_title("Along the arm")
     return chart(figure, "Comparison error, validation uncertainty and area metric by key point")
 
@@ -188,7 +188,7 @@ def _area_chart(found: Assessment) -> Picture:
             axis.step(some, share, style, c=colour, lw=1.1, where="post", label=name)
     axis.set_xlabel("coordinate [mm]")
     axis.set_ylabel("share of rows")
-    axis.legend(fontsize=6, ncols=2)
+    figure.legend(loc="outside lower center", ncols=3, fontsize=8)
     axis.set_title("Distributions of the tip (area metric)")
     return chart(figure, "Distribution functions of the tip's coordinates, measured and predicted")
 
@@ -363,7 +363,7 @@ def _scatter(points, inside: np.ndarray, names: tuple[str, str], title: str) -> 
             axis.scatter(some[:, 0], some[:, 1], s=4, c=colour, lw=0, rasterized=True, label=name)
     axis.set_xlabel(names[0])
     axis.set_ylabel(names[1])
-    axis.legend(fontsize=7, markerscale=2)
+    figure.legend(loc="outside lower center", ncols=3, fontsize=8, markerscale=2)
     axis.set_title(title)
     return chart(figure, f"{title}: validated states and states of the scenario")
 

@@ -5,8 +5,12 @@ the model of the package is compared with the recording, the missing effect is n
 is amended. Every step is the command that it prints; one page shows them all.
 """
 
+import contextlib
 import os
-from dataclasses import dataclass, replace
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from surgisoft.agents.report import episode_parts
@@ -19,14 +23,12 @@ from surgisoft.diagnosis.pages.compare import write_report
 from surgisoft.diagnosis.pages.diagnosis import diagnosis_page
 from surgisoft.diagnosis.residuals import residual_table
 from surgisoft.errors import InputError
-from surgisoft.files import new_folder
-from surgisoft.measurement.recordings import save_recording
+from surgisoft.measurement.recordings import load_recordings
 from surgisoft.progress import Progress, silent
 from surgisoft.replay.episode_view import write_replay
 from surgisoft.replay.model_error import write_compared, write_models
 from surgisoft.replay.show import open_replay
-from surgisoft.report import Command, Page, Picture, Section, Text, write_page
-from surgisoft.rig.trial import collect
+from surgisoft.report import Command, Page, Part, Picture, Section, Text, write_page
 from surgisoft.surrogate.checkpoint import save_model
 
 FOLDER = "surgisoft_demo"
@@ -39,8 +41,16 @@ POINTS = 6000
 """Samples of the recording: five minutes of the bench at 20 Hz."""
 BROAD_PX = 620
 """Width below which a broad picture scrolls, pixels."""
-STEPS = ("cut", "measure", "compare", "diagnose", "amend")
-"""Names of the steps, in their order."""
+RECORDING = "bench.parquet"
+"""File of the recording."""
+STEPS = (
+    ("cut", "Two arms cut a ring around a lesion"),
+    ("measure", "A robot is measured"),
+    ("compare", "Where does the model fail?"),
+    ("diagnose", "Which physical effect is missing?"),
+    ("amend", "The effect is added, and the error falls"),
+)
+"""Name and title of each step, in their order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,73 +69,139 @@ class Demonstration:
     """The page with all five steps."""
     no_picture: str
     """Why there is no picture of the replay; empty where there is one."""
-
-    @property
-    def sentences(self) -> dict[str, str]:
-        """Result of each step in one sentence, by its name."""
-        return {
-            "cut": _cut_sentence(self.cut),
-            "measure": f"a robot with hidden {HIDDEN} was recorded for {POINTS // 20} s",
-            "compare": self.comparison.sentence,
-            "diagnose": self.diagnosis.verdict.sentence,
-            "amend": self.amendment.sentence if self.amendment else "no effect was named to add",
-        }
+    sentences: dict[str, str]
+    """Result of each step in one sentence, by its name."""
 
 
 def demo(
-    folder: str | Path = FOLDER, *, policy: str | Path = POLICY, progress: Progress = silent
+    folder: str | Path = FOLDER,
+    *,
+    policy: str | Path = POLICY,
+    progress: Progress = silent,
+    on_step: Callable[[str, str], None] = lambda name, sentence: None,
 ) -> Demonstration:
     """Run the demonstration into a new folder, whose `index.html` shows it.
 
-    The folder appears when all five are done. policy: the training run of `circle_ablation` that
-    cuts the ring; by default the one of the package. Raises InputError where the folder is not
-    empty or cannot be written.
+    The page is there after the first step and grows with each: most of the time of a first run is
+    compilation, and the picture of the cut need not wait for it. Every file is written whole.
+    policy: the training run of `circle_ablation` that cuts the ring; by default the one of the
+    package. on_step: called with name and result of each step. Raises InputError where the folder
+    is not empty or cannot be written.
     """
     folder = Path(folder)
     _claim(folder)
-    with new_folder(folder) as fresh:
-        result = _five_steps(fresh, policy, progress)
-    return replace(result, page=folder / result.page.name)
-
-
-def _five_steps(folder: Path, policy: str | Path, progress: Progress) -> Demonstration:
-    """Run the steps into a folder that is there."""
     progress(0, 100, "step 1 of 5: two arms cut a ring")
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with _recorder(folder / RECORDING) as recorded:
+            return _five_steps(folder, policy, progress, on_step, recorded)
+    finally:
+        with contextlib.suppress(OSError):
+            folder.rmdir()  # of a demonstration that ended before its first file
+
+
+def _five_steps(
+    folder: Path,
+    policy: str | Path,
+    progress: Progress,
+    on_step: Callable[[str, str], None],
+    recorded: Callable[[], None],
+) -> Demonstration:
+    """Run the five steps and write their files into an existing folder.
+
+    recorded: waits for the recording, which is made meanwhile.
+    """
+    story = _Story(folder / "index.html", on_step)
     cut = evaluate(policy, "circle_ablation", episodes=1, log=(str(policy),))
     log = cut.logs[str(policy)]
     write_replay(log, folder / "cut.rrd")
     progress(25, 100, "step 1 of 5: picture of the replay")
     picture, no_picture = _replay_picture(folder / "cut.rrd", folder / "cut.png")
+    story.tell(
+        f"evaluate {policy} --episodes 1 --replay cut.rrd",
+        _cut_sentence(cut),
+        _cut_parts(log, picture),
+    )
 
     progress(40, 100, "step 2 of 5: a robot is recorded")
-    recording = collect("mixed", seed=0, points=POINTS, hidden=[HIDDEN])
-    save_recording(recording, folder / "bench.parquet")
+    recorded()
+    story.tell(
+        " ".join(_collect_arguments(RECORDING)),
+        f"a robot with hidden {HIDDEN} was recorded for {POINTS // 20} s",
+        MEASURED,
+    )
 
     progress(60, 100, "step 3 of 5: the model is compared with it")
-    comparison, table = compare("default", folder / "bench.parquet")
+    comparison, table = compare("default", folder / RECORDING)
     compared = [Compared("default", comparison, table)]
     _, *drawn = write_report(compared, folder / "compare", "default on bench")
     write_compared(compared, "default on bench", folder / "compare.rrd")
+    story.tell(
+        f"compare default {RECORDING} --report compare",
+        comparison.sentence,
+        _error_pictures(drawn),
+    )
 
     progress(70, 100, "step 4 of 5: which effect is missing?")
-    found = diagnose("default", folder / "bench.parquet")
+    found = diagnose("default", folder / RECORDING)
     write_page(diagnosis_page(found, "default"), folder / "diagnosis.html")
+    story.tell(f"diagnose default {RECORDING}", found.verdict.sentence, _ranking_parts(found))
 
     progress(80, 100, "step 5 of 5: the effect is added")
-    amendment = None
+    amendment, command = None, ""
     if found.verdict.effects:
-        amendment = amend("default", folder / "bench.parquet", list(found.verdict.effects))
+        names = " ".join(found.verdict.effects)
+        command = f"amend default --effect {names} --data {RECORDING} -o amended"
+        amendment = amend("default", folder / RECORDING, list(found.verdict.effects))
         save_model(amendment.model, folder / "amended")
         page = amend_page(amendment, "default, amended", amendment.model.summary())
         write_page(page, folder / "amendment.html")
-        tables = {"before": table, "after": residual_table(amendment.model, [recording])}
+        recordings = load_recordings([folder / RECORDING])
+        tables = {"before": table, "after": residual_table(amendment.model, recordings)}
         title = "Before and after the amendment"
         write_models(tables, title, folder / "amended.rrd", amendment.sentence)
-
-    result = Demonstration(cut, comparison, found, amendment, folder / "index.html", no_picture)
-    write_page(_page(result, log, picture, drawn), result.page)
+    story.tell(
+        command,
+        amendment.sentence if amendment else "no effect was named to add",
+        _amended_parts(amendment),
+        tone="good" if amendment is not None and amendment.claimed else "warn",
+    )
     progress(100, 100, "done")
-    return result
+    return Demonstration(
+        cut, comparison, found, amendment, story.page, no_picture, dict(story.sentences)
+    )
+
+
+@contextlib.contextmanager
+def _recorder(file: Path) -> Iterator[Callable[[], None]]:
+    """Record the robot in a process of its own; yields a function that waits for the recording.
+
+    A first run compiles the rig for half a minute, while this process compiles the scene. Leaving
+    the block ends the process.
+    """
+    command = [sys.executable, "-m", "surgisoft", *_collect_arguments(str(file))]
+    quiet = subprocess.DEVNULL
+    child = subprocess.Popen(
+        command, stdin=quiet, stdout=quiet, stderr=subprocess.PIPE, encoding="utf-8"
+    )
+
+    def wait() -> None:
+        _, errors = child.communicate()
+        if child.returncode:
+            why = errors.strip().splitlines()[-1:] or [f"it ended with status {child.returncode}"]
+            raise InputError(f"the robot could not be recorded: {why[0]}")
+
+    try:
+        yield wait
+    finally:
+        if child.poll() is None:
+            child.terminate()
+            child.communicate()
+
+
+def _collect_arguments(file: str) -> list[str]:
+    """The command line that records the robot."""
+    return ["collect", "mixed", "--points", str(POINTS), "--hidden", HIDDEN, "-o", file]
 
 
 def _claim(folder: Path) -> None:
@@ -148,12 +224,43 @@ def _replay_picture(replay: Path, file: Path) -> tuple[Path | None, str]:
     return file, ""
 
 
-def _page(result: Demonstration, log, picture: Path | None, drawn: list[Path]) -> Page:
-    """The page with all five steps."""
-    said = {name: text[:1].upper() + text[1:] + "." for name, text in result.sentences.items()}
-    cut: list = [
-        Command(f"surgisoft evaluate {POLICY} --episodes 1 --replay cut.rrd"),
-        Text(said["cut"]),
+@dataclass
+class _Story:
+    """The page of the demonstration, which grows by a section with each step."""
+
+    page: Path
+    """Its file."""
+    on_step: Callable[[str, str], None]
+    """Called with name and result of each step."""
+    sentences: dict[str, str] = field(default_factory=dict)
+    """Result of each step so far, by its name."""
+    sections: list[Section] = field(default_factory=list)
+    """Sections of the page so far."""
+
+    def tell(self, command: str, sentence: str, parts: Sequence[Part], tone: str = "plain") -> None:
+        """Add the next step, and write the page.
+
+        command: what it ran, empty where it ran nothing. tone: colour of the page's verdict.
+        """
+        name, title = STEPS[len(self.sections)]
+        said = f"{sentence[:1].upper()}{sentence[1:]}."
+        number = len(self.sections) + 1
+        told = [Command(f"surgisoft {command}")] if command else []
+        self.sections.append(Section(f"{number}. {title}", [*told, Text(said), *parts]))
+        self.sentences[name] = sentence
+        left = len(STEPS) - number
+        verdict = said
+        if left:
+            steps = "a step follows" if left == 1 else f"{left} steps follow"
+            verdict = f"{said} This page grows: {steps}, reload it."
+        page = Page("surgisoft in five steps", verdict, self.sections, "surgisoft demo", tone)
+        write_page(page, self.page)
+        self.on_step(name, sentence)
+
+
+def _cut_parts(log, picture: Path | None) -> list[Part]:
+    """What step 1 shows: the replay's picture, and charts of the episode."""
+    parts: list[Part] = [
         Text(
             "Two soft arms over a liver phantom: one carries the laser, the other the endoscope. "
             "The policies see pressures, key points and the lesion. An exact collision checker "
@@ -162,67 +269,35 @@ def _page(result: Demonstration, log, picture: Path | None, drawn: list[Path]) -
         ),
     ]
     if picture is not None:
-        cut.append(Picture.from_file(picture, "The episode in the Rerun viewer", "cut.rrd"))
-    cut += episode_parts(log)[:-1]
-    amended: list = [Text(said["amend"])]
-    if result.amendment is not None:
-        names = " ".join(result.amendment.effects)
-        amended = [
-            Command(f"surgisoft amend default --effect {names} --data bench.parquet -o amended"),
-            *amended,
-            *track_charts(
-                {"Held-out part of the recording": result.amendment.tracks[1]},
-                result.amendment.held_out.floor,
-            ),
-            Text(
-                "The folder amended holds the new model; it is used like any other, for example "
-                "by `surgisoft train --task track_circle --arm amended`. "
-                "Details: `amendment.html`; before and after in 3-D: "
-                "`surgisoft replay amended.rrd`"
-            ),
-        ]
-    return Page(
-        title="surgisoft in five steps",
-        verdict=said["amend"],
-        about="surgisoft demo",
-        tone="good" if result.amendment is not None and result.amendment.claimed else "warn",
-        parts=[
-            Section("1. Two arms cut a ring around a lesion", cut),
-            Section(
-                "2. A robot is measured",
-                [
-                    Command(
-                        f"surgisoft collect mixed --points {POINTS} --hidden {HIDDEN} "
-                        "-o bench.parquet"
-                    ),
-                    Text(
-                        "The virtual rig plays a robot that creeps: its wall yields slowly under "
-                        "load. The model does not know. On a bench of your own the recording comes "
-                        "from `surgisoft import` or from a rig driver."
-                    ),
-                ],
-            ),
-            Section(
-                "3. Where does the model fail?",
-                [
-                    Command("surgisoft compare default bench.parquet --report compare"),
-                    Text(said["compare"]),
-                    *_error_pictures(drawn),
-                    Text("Details: `compare/report.html`; in 3-D: `surgisoft replay compare.rrd`"),
-                ],
-            ),
-            Section(
-                "4. Which physical effect is missing?",
-                [
-                    Command("surgisoft diagnose default bench.parquet"),
-                    Text(said["diagnose"]),
-                    *_ranking_parts(result.diagnosis),
-                    Text("Details: `diagnosis.html`"),
-                ],
-            ),
-            Section("5. The effect is added, and the error falls", amended),
-        ],
-    )
+        parts.append(Picture.from_file(picture, "The episode in the Rerun viewer", "cut.rrd"))
+    return [*parts, *episode_parts(log)[:-1]]
+
+
+MEASURED = (
+    Text(
+        "The virtual rig simulates a robot that creeps: its wall yields slowly under load. The "
+        "model does not contain creep. On a bench of your own the recording comes from "
+        "`surgisoft import` or from a rig driver."
+    ),
+)
+"""What step 2 shows."""
+
+
+def _amended_parts(amendment: Amendment | None) -> list[Part]:
+    """What step 5 shows: the error of the held-out part before and after."""
+    if amendment is None:
+        return []
+    return [
+        *track_charts(
+            {"Held-out part of the recording": amendment.tracks[1]}, amendment.held_out.floor
+        ),
+        Text(
+            "The folder amended holds the new model; it is used like any other, for example "
+            "by `surgisoft train --task track_circle --arm amended`. "
+            "Details: `amendment.html`; before and after in 3-D: "
+            "`surgisoft replay amended.rrd`"
+        ),
+    ]
 
 
 def _cut_sentence(cut: Evaluations) -> str:
@@ -237,8 +312,8 @@ def _cut_sentence(cut: Evaluations) -> str:
     )
 
 
-def _error_pictures(drawn: list[Path]) -> list:
-    """Body, loops and error; the broad ones scroll on a narrow page."""
+def _error_pictures(drawn: list[Path]) -> list[Part]:
+    """What step 3 shows: body, loops and error; the broad ones scroll on a narrow page."""
     by_name = {path.stem: path for path in drawn}
     return [
         Picture.from_file(by_name["body"], "Measured and predicted bodies", drawn=True),
@@ -246,11 +321,12 @@ def _error_pictures(drawn: list[Path]) -> list:
             by_name["loops"], "Loops, measured and predicted", "", BROAD_PX, drawn=True
         ),
         Picture.from_file(by_name["error"], "Error over the recording", "", BROAD_PX, drawn=True),
+        Text("Details: `compare/report.html`; in 3-D: `surgisoft replay compare.rrd`"),
     ]
 
 
-def _ranking_parts(found: Diagnosis) -> list:
-    """Chart and table of the ranked effects, as on the page of the diagnosis."""
+def _ranking_parts(found: Diagnosis) -> list[Part]:
+    """What step 4 shows: chart and table of the ranked effects, as on the diagnosis' page."""
     page = diagnosis_page(found, "default")
     section = next((p for p in page.parts if isinstance(p, Section) and p.title == "Effects"), None)
-    return list(section.parts) if section is not None else []
+    return [*(section.parts if section else ()), Text("Details: `diagnosis.html`")]

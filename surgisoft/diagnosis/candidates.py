@@ -186,7 +186,10 @@ def more_of(problem: RowsOfModel, signal: Signals, name: str) -> Candidate | Non
     effect = problem.model.effects[name]
     if effect.stage != "material":
         return None
-    before, after = problem.model.chain.around(name, signal.taps)
+    taps = signal.taps
+    if name not in taps.memory:
+        taps = problem.model.trace(problem.history)
+    before, after = problem.model.chain.around(name, taps)
     change = problem.rows(after - before)
     each = torch.diag_embed(change).movedim(-1, 0)
     sensitivities = torch.einsum(

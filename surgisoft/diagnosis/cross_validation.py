@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import linalg
 
+from surgisoft.compiled import compiled
 from surgisoft.diagnosis.discrepancy import kernel
 from surgisoft.diagnosis.residuals import Problem
 
@@ -249,9 +250,8 @@ class CrossValidation:
         if key not in self.cache:
             rows = np.concatenate([[0], sensitivities + 1])
             amplitudes = _amplitudes(self.grams[:, :, rows[:, None], rows])
-            mix = np.insert(-amplitudes, 0, 1.0, axis=-1)[:, :, self.split.fold]
-            part = self.held_out[:, :, rows[:, None], rows].astype(float)
-            losses = (mix * (part[:, None] @ mix[..., None])[..., 0]).sum(axis=-1)
+            losses = np.empty((*amplitudes.shape[:2], len(self.split.fold)))
+            _sum_squares(self.held_out, rows, amplitudes, self.split.fold, losses)
             self.cache[key] = losses, amplitudes
         return self.cache[key]
 
@@ -307,6 +307,34 @@ def _bordered(inner: np.ndarray, border: np.ndarray) -> np.ndarray:
     answer[..., first:] = border
     answer[..., first:, :first] = np.swapaxes(border[..., :first, :], -1, -2)
     return answer
+
+
+@compiled
+def _sum_squares(held_out, rows, amplitudes, fold, losses):
+    """Held-out sums of squares into losses (L, r, B), mm^2: x' G x with x = (1, -amplitudes).
+
+    held_out (L, B, C, C) products G of all columns; rows (1 + k,) those that are looked at;
+    amplitudes (L, r, folds, k); fold (B,) of each block.
+    """
+    levels, ridges, blocks = losses.shape
+    size = len(rows)
+    part, mix = np.empty((size, size)), np.empty(size)
+    mix[0] = 1.0
+    for level in range(levels):
+        for block in range(blocks):
+            for i in range(size):
+                for j in range(size):
+                    part[i, j] = held_out[level, block, rows[i], rows[j]]
+            for ridge in range(ridges):
+                for i in range(1, size):
+                    mix[i] = -amplitudes[level, ridge, fold[block], i - 1]
+                total = 0.0
+                for i in range(size):
+                    along = 0.0
+                    for j in range(size):
+                        along += part[i, j] * mix[j]
+                    total += mix[i] * along
+                losses[level, ridge, block] = total
 
 
 def _amplitudes(gram: np.ndarray) -> np.ndarray:

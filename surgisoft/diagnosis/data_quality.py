@@ -6,22 +6,24 @@ from scipy.spatial import cKDTree
 from surgisoft.diagnosis.residuals import Problem
 
 FAR_FROM_FIT = 2.0
-"""An actuation is far from those of the fit beyond this multiple of the distance that 97 % of
-those keep from their nearest neighbour."""
+"""An actuation is far from the fit where its distance from the nearest actuation of the fit exceeds
+this multiple of `NEIGHBOURS`."""
+NEIGHBOURS = 0.97
+"""Quantile of the distances between each actuation of the fit and its nearest neighbour there."""
 LEAST_FAR = 0.2
-"""Least such distance, in half ranges of a chamber."""
+"""Distance below which no actuation is far from the fit, in half ranges of a chamber."""
 FAR_ROWS = 0.1
-"""Share of rows at far actuations from which there is a warning."""
+"""Share of rows at far actuations above which a warning is given."""
 LONG_ROWS = 100_000
-"""Training rows from which a diagnosis says how they are thinned."""
+"""Number of training rows from which a diagnosis states how they are thinned."""
 SOURCE_OF_SMOOTH = "second differences"
 """Source of a noise floor that is neither stated nor shown by holds."""
 MOST_MISSING = 0.2
-"""Share of missing key points from which there is a warning."""
+"""Share of missing key points above which a warning is given."""
 
 
 def _far_from_fit(problem: Problem) -> float:
-    """Share of the rows whose actuation lies far from all that the model was fitted on."""
+    """Share of the rows whose actuation is far from all that the model was fitted on."""
     known = problem.reference
     if known is None or len(known.pressure) < 2:
         return 0.0
@@ -29,11 +31,11 @@ def _far_from_fit(problem: Problem) -> float:
 
 
 def far_share(known: np.ndarray, asked: np.ndarray) -> float:
-    """Share of actuations (S, m) that lie far from all known ones (K, m), in half ranges."""
+    """Share of actuations `asked` (S, m) that are far from all `known` (K, m), in half ranges."""
     tree = cKDTree(known)
     own = tree.query(known, k=2, p=np.inf)[0][:, 1]
     apart = tree.query(asked, p=np.inf)[0]
-    return float(np.mean(apart > max(FAR_FROM_FIT * np.quantile(own, 0.97), LEAST_FAR)))
+    return float(np.mean(apart > max(FAR_FROM_FIT * np.quantile(own, NEIGHBOURS), LEAST_FAR)))
 
 
 def thinning_notes(problem: Problem) -> tuple[str, ...]:
@@ -48,7 +50,7 @@ def thinning_notes(problem: Problem) -> tuple[str, ...]:
 
 
 def data_quality_warnings(problem: Problem) -> list[str]:
-    """One sentence for each warning."""
+    """Warnings about the recordings of an identification problem, one sentence each."""
     warnings, source = [], problem.table.floor.source
     if source in (SOURCE_OF_SMOOTH, "unknown"):
         warnings.append(

@@ -24,6 +24,7 @@ and hashes stand in `assets/decision/decision.json`.
 import hashlib
 import json
 import math
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -657,7 +658,9 @@ def load_decision(path: Path = ASSET) -> DecisionModel:
             )
         each = tuple(float(weights.get(feature.name, 0.0)) for feature in features)
         models[name] = Logistic(each, numbers[-1])
-    curves = _table(values.get("calibration"))
+    curves = values.get("calibration", {})
+    if not isinstance(curves, dict):
+        raise InputError(f"{path.name}: calibration is no table; fit it again")
     for name, one in curves.items():
         given = _table(one)
         if name not in CALIBRATED or not all(_finite(given.get(k)) for k in ("constant", "slope")):
@@ -669,7 +672,7 @@ def load_decision(path: Path = ASSET) -> DecisionModel:
 
 
 def _finite(value: Any) -> bool:
-    return type(value) in (int, float) and abs(value) < math.inf
+    return type(value) in (int, float) and abs(value) <= sys.float_info.max
 
 
 def decision_of(models: dict[str, Logistic], values: dict[str, Any]) -> DecisionModel:

@@ -177,7 +177,8 @@ class ResidualTable:
     paired_tolerance_mm: np.ndarray | None = None
     """(n,) where they are paired differences: `Problem.tolerance_mm`."""
     taps: Taps | None = None
-    """What the model's scan of the history gave: signals and memories in every row."""
+    """What the model's scan of the history gave: signals in every row, and memories where there are
+    not very many rows."""
     body_before_mm: np.ndarray | None = None
     """(N, n, 3) where they are paired differences: key points of BEFORE along the same motion, base
     frame, mm, without gaps."""
@@ -315,7 +316,7 @@ def residual_table(model: ArmModel, recordings: list[Recording]) -> ResidualTabl
     check_fits(model.spec, recordings, sized=False)
     history = history_of(recordings, model.spec.actuation)
     with torch.no_grad():
-        taps = model.scan(history)
+        taps = model.scan(history, memories=False)
         predicted = history.rows(taps.behind["sensor"])
         direction = history.rows(taps.direction)
     if not torch.isfinite(predicted).all():

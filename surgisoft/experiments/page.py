@@ -63,15 +63,19 @@ def verdict(results: Results) -> str:
     settings, faults = results.settings, results.experiment.faults
     unsafe = max(row["beam_unsafe_longest_s"] for row in results.rows)
     hits = sum(row.get("collided", 0.0) > 0.0 for row in results.rows)
+    each = "; ".join(f"{s.label.replace('_', ' ')}: {_one(s)}" for s in settings)
     if faults:
-        ended = [row for row in results.rows if row["outcome"].startswith("aborted")]
-        first = (
-            f"After the fault {len(ended)} of {len(results.rows)} episodes were aborted, "
-            f"{sum(row['success'] for row in results.rows):.0f} were cut nevertheless; "
-            f"the beam was on for at most {unsafe:.2g} s while it was unsafe"
-        )
+        ended = sum(row["outcome"].startswith("aborted") for row in results.rows)
+        first = f"After the fault {ended} of {len(results.rows)} episodes were aborted"
+        if _beams(results):
+            first += (
+                f", {sum(row['success'] for row in results.rows):.0f} were cut nevertheless; "
+                f"the beam was on for at most {unsafe:.2g} s while it was unsafe"
+            )
+        elif len(settings) <= SHOWN:
+            first += f"; {each}"
     elif len(settings) <= SHOWN:
-        first = "; ".join(f"{s.label.replace('_', ' ')}: {_one(s)}" for s in settings)
+        first = each
     else:
         shares = [s.overall["success"].mean for s in settings]
         low, high = min(shares), max(shares)

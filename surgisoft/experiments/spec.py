@@ -24,7 +24,7 @@ from surgisoft.config import (
 )
 from surgisoft.errors import InputError
 from surgisoft.scene.spec import SCENES, Length, Point
-from surgisoft.tasks.registry import TASKS, spec_of, with_present_names
+from surgisoft.tasks.registry import spec_of, task_names, with_present_names
 from surgisoft.tasks.spec import TaskSpec
 
 FORMAT = 1
@@ -53,6 +53,10 @@ Count = Annotated[int, Rule("a whole number from 1 to 100000", lambda n: 1 <= n 
 Seed = Annotated[int, Rule("a whole number from 0 to 2147483647", lambda n: 0 <= n < 2**31)]
 Format = Annotated[int, Rule(f"{FORMAT}", lambda number: number == FORMAT)]
 AnyLength = Annotated[float, Rule("a number from -1000 to 1000 mm", lambda v: abs(v) <= 1000.0)]
+
+
+A_TASK = Rule("a task's name", lambda value: value in task_names())
+"""A task of this package, or of an installed one."""
 
 
 def _one_of(known: Iterable[str]) -> Rule:
@@ -185,7 +189,7 @@ class Experiment:
     """Name of the experiment."""
     phases: tuple[Phase, ...]
     """Phases of an episode, in order."""
-    scenario: Annotated[str, _one_of(TASKS)] = FIRST_TASK
+    scenario: Annotated[str, A_TASK] = FIRST_TASK
     """Name of the task, as in `surgisoft evaluate --task`."""
     scene: str = ""
     """Folder of the scene, relative to the file; empty for a task without a scene."""
@@ -230,8 +234,9 @@ def load_experiment(path: str | Path) -> Experiment:
     path = Path(path)
     table, where = read_toml(path)
     name = table.get("scenario", FIRST_TASK)
-    if not isinstance(name, str) or name not in TASKS:
-        raise (where / "scenario").error(f"got {describe(name)}", f"one of {', '.join(TASKS)}")
+    if not isinstance(name, str) or name not in task_names():
+        known = ", ".join(task_names())
+        raise (where / "scenario").error(f"got {describe(name)}", f"one of {known}")
     of = spec_of(name)
     given = table.pop("task", {})
     if not isinstance(given, dict):

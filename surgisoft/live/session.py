@@ -51,7 +51,7 @@ from surgisoft.rig.safety import SafeRig, Terminated
 from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.tasks.base import Episodes, Task, TaskState
-from surgisoft.tasks.registry import TASKS, make_task, spec_of, with_fields
+from surgisoft.tasks.registry import make_task, spec_of, task_names, with_fields
 
 if TYPE_CHECKING:
     from surgisoft.replay.live_view import LiveView
@@ -148,7 +148,8 @@ class RunRequest:
         least = LEAST_BLOCKS * self.alarm.block_s + 2.0
         if not least <= self.reference_s < math.inf:
             raise InputError(
-                f"reference is {self.reference_s:g} s, expected at least {least:g} s of clean run"
+                f"--clean {self.reference_s:g}: expected at least {least:g} s at the start of the "
+                "run in which the arm is unchanged, or recordings of it by --before"
             )
 
     @property
@@ -472,7 +473,7 @@ class _Session:
             if config is None and task == folder.config["task"]:
                 config = folder.plan().task_config
         if task is None:
-            raise InputError(f"--task is missing; expected one of {', '.join(sorted(TASKS))}")
+            raise InputError(f"--task is missing; expected one of {', '.join(task_names())}")
         if len(spec_of(task).agents) != 1:
             raise InputError(
                 f"task '{task}' has the arms {', '.join(spec_of(task).agents)}, and a rig has one; "

@@ -150,6 +150,8 @@ class _Thrift:
         return self.data[self.at - 1]
 
     def _skip(self, count: int) -> None:
+        if count > self.end - self.at:
+            raise ValueError("a header without an end")
         self.at += count
 
     def _unsigned(self) -> int:

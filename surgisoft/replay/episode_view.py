@@ -33,6 +33,7 @@ from surgisoft.replay.shapes import creased, widest_apart
 from surgisoft.replay.surfaces import DosedSurface, dosed_surface
 from surgisoft.scene import frames
 from surgisoft.scene.mesh import Mesh
+from surgisoft.scene.rays import EmbreeSurface
 from surgisoft.scene.render import LESION_TINT
 from surgisoft.tasks.episodes.log import DoseLog, EpisodeLog
 
@@ -59,7 +60,7 @@ def episode_blueprint(log: EpisodeLog, plots: tuple[Plot, ...]) -> rrb.Blueprint
     if log.dose is not None:
         dose = rrb.Spatial2DView(origin=DOSE, name="Dose", background=BACKGROUND)
         below = rrb.Horizontal(_events(), legend, dose, column_shares=[3, 3, 2])
-    left = rrb.Vertical(_scene(log), below, row_shares=[4.0, 1])
+    left = rrb.Vertical(_scene(log), below, row_shares=[3.2, 1])
     right = rrb.Vertical(*rows, row_shares=shares)
     return rrb.Blueprint(
         rrb.Horizontal(left, right, column_shares=[1.15, 1.0]),
@@ -280,9 +281,38 @@ def finite_rows(log: EpisodeLog, rate_hz: float) -> np.ndarray:
     return rows[np.all(finite, axis=0)]
 
 
+LOOKS = 40
+"""Points of the work to which lines of sight are drawn (a count)."""
+MOST_HIDDEN = 0.25
+"""Share of those lines that a body may cut before it is drawn see-through."""
+SEE_THROUGH = 70
+"""Opacity of a body in front of the work, 0..255."""
+
+
+def hiding_bodies(log: EpisodeLog) -> list[str]:
+    """Names of bodies between the eye of the 3D view and the work, such as a wall with ports."""
+    eye, _ = viewpoint(log)
+    work = np.concatenate(log.paths_mm) if log.paths_mm else log.target_mm
+    work = work[np.isfinite(work).all(axis=1)]
+    aims = work[:: max(1, len(work) // LOOKS)].astype(float) - eye
+    away = np.linalg.norm(aims, axis=1)
+    if not len(away) or away.min() <= 0.0:
+        return []
+    eyes, hidden = np.tile(np.asarray(eye, float), (len(aims), 1)), []
+    for body in log.bodies:
+        if log.dose is not None and body.name == log.dose.body:
+            continue  # the tissue itself
+        surface = EmbreeSurface(Mesh(body.vertices_mm, body.faces))
+        met, _ = surface.first_hit(eyes, aims / away[:, None], float(away.max()) + 1.0)
+        if float((met < away - 1.0).mean()) > MOST_HIDDEN:
+            hidden.append(body.name)
+    return hidden
+
+
 def _log_bodies(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
     """Log every body once, and its motion in the log's `rows`; the organ's faces around the lesion
     separately, coloured by dose."""
+    hiding = hiding_bodies(log)
     for body in log.bodies:
         mesh, entity = Mesh(body.vertices_mm, body.faces), f"/bodies/{body.name}"
         kept = np.ones(len(mesh.faces), dtype=bool)
@@ -295,7 +325,10 @@ def _log_bodies(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
             vertex_positions=vertices,
             triangle_indices=faces[kept],
             vertex_normals=normals,
-            albedo_factor=ROLE_COLOURS[body.role],
+            albedo_factor=(
+                *ROLE_COLOURS[body.role],
+                SEE_THROUGH if body.name in hiding else 255,
+            ),
         )
         columns.recording.log(entity, plain, static=True)
         if body.motion is not None:
@@ -415,16 +448,17 @@ def _log_beam(columns: Columns, log: EpisodeLog, name: str, rows: np.ndarray) ->
 def legend(log: EpisodeLog) -> str:
     """Markdown that explains those colours of the 3D view that occur in the log."""
     rows = [
-        ("yellow", "reference: path and target", True),
-        ("cyan", "actual path, while the beam is on" if log.beams else "actual path", True),
-        ("green line", "beam; thick while it is on", bool(log.beams)),
-        ("blue lines", "field of view of the endoscope's camera", bool(log.cameras)),
-        ("pale, then black", "tissue below and above the dose of ablation", log.dose is not None),
+        ("yellow", "reference path and target", True),
+        ("cyan", "actual path, beam on" if log.beams else "actual path", True),
+        ("green line", "beam; thick while on", bool(log.beams)),
+        ("blue lines", "the endoscope's field of view", bool(log.cameras)),
+        ("pale, black", "tissue below, above ablation", log.dose is not None),
         ("white points", "key points as measured by the cameras", log.on == "rig"),
     ]
     lines = [f"- **{colour}**: {meaning}" for colour, meaning, shown in rows if shown]
     roles = {body.role for body in log.bodies}
     lines += [f"- **{c}**: {role}" for role, c in ROLE_NAMES.items() if role in roles]
+    lines += [f"- **see-through**: {name}, in front of the work" for name in hiding_bodies(log)]
     what = f"**{log.task}** by {log.driver} in {log.on}"
     last = f": {log.events[-1].text} at {log.events[-1].time_s:.1f} s" if log.events else ""
     return f"{what}{last}.\n\n" + "\n".join(lines) + "\n"

@@ -49,6 +49,8 @@ LARGE_MM = 1.0
 """Residual at which the colour scale of the key points ends (mm)."""
 WINDOW_S = 60.0
 """Time that the plots show while the run lasts (s)."""
+PAUSE_S = 2.0
+"""Time between two samples beyond which the lines of the plots are broken, s."""
 FLUSH_S = 30.0
 """Longest time that is waited for the view's last data to be written, s; rerun-sdk 0.41 would wait
 for ever where a disk is full."""
@@ -123,6 +125,8 @@ class LiveView:
         statistic: the detector's largest chart over its threshold, nan where there is none.
         """
         log = self.recording.log
+        if t_s - self.end_s > PAUSE_S:
+            self._break_lines(len(pressure), len(measured_mm))
         self.end_s = t_s
         self.recording.set_time(TIME, duration=t_s)
         residual = measured_mm - predicted_mm
@@ -143,6 +147,17 @@ class LiveView:
         if not math.isnan(statistic):
             log("/plots/alarm/level", rr.Scalars(statistic))
             log("/plots/alarm/threshold", rr.Scalars(1.0))
+
+    def _break_lines(self, chambers: int, points: int) -> None:
+        """End the lines of the plots behind the last sample: the arm rests between two runs."""
+        self.recording.set_time(TIME, duration=self.end_s + 1e-3)
+        for place, count in (
+            ("pressure/measured", chambers),
+            ("pressure/sent", chambers),
+            ("residual/key_points", points),
+            ("alarm/level", 1),
+        ):
+            self.recording.log(f"/plots/{place}", rr.Scalars([math.nan] * count))
 
     def tracking(self, t_s: float, error_mm: float) -> None:
         """Show the error of the policy's task (mm)."""

@@ -23,7 +23,8 @@ import numpy as np
 from surgisoft.compiled import compiled
 
 LAST_STEP = 3e-6
-"""Newton's method ends after a step in strain [-] below this; the error left is of its square."""
+"""Newton's method ends after a step in strain [-] below this; it converges quadratically, so the
+error left is of the order of the step's square."""
 NOT_CONVERGED = 99
 """Iterations that stand for a section without equilibrium."""
 

@@ -193,6 +193,7 @@ class Scanning:
         rows: Callable[[Tensor], Tensor] | None = None,
         direction: Tensor | None = None,
         history: History | None = None,
+        keeps: bool = True,
     ):
         """Set where the scan starts and which rows it computes.
 
@@ -200,9 +201,10 @@ class Scanning:
         temperatures; rows: picks the rows (S, ...) of a (R, T, ...) tensor that the network and all
         effects behind it compute, which must then have no memory (None: every row); direction: (R,
         T, m) direction of change where it is known, as in a window of a longer scan; history: the
-        runs that are scanned, which networks of whole runs need.
+        runs that are scanned, which networks of whole runs need; keeps: whether memories are kept
+        where there are very many rows and all are asked for.
         """
-        self.history = history
+        self.history, self.keeps = history, keeps
         self.start, self.context, self.rows, self.given = start, context, rows, direction
         self.memory: dict[str, Tensor] = {}
 
@@ -220,15 +222,12 @@ class Scanning:
         return direction_scan(chamber, chain.band, chain.rest)[1]
 
     def effect(self, link: Link, signal: Signal) -> Tensor:
-        """Signal behind an effect whose memory has followed every row.
-
-        The memory is kept, unless only some rows are asked for and there are very many.
-        """
+        """Signal behind an effect whose memory has followed every row; see `keeps`."""
         part, value = link.part, signal.value
         if self.rows is not None and link.stage in ("body", "sensor"):
             return part.apply(value, value[..., :0, 0])
         start, context = self.start[link.name], self.context_at(signal)
-        if self.rows is not None and _very_many(value):
+        if (self.rows is not None or not self.keeps) and _very_many(value):
             answer = torch.empty_like(value)
             for place, memory in _followed(part, start, value, context):
                 answer[place] = part.apply(value[place], memory)
@@ -483,16 +482,34 @@ class Chain:
         direction = signal.behind_chambers()[1]
         return ArmState(pressure, mode.anchor, direction, mode.memory), signal.value
 
-    def scan(self, history: History, first: Tensor, links: tuple[Link, ...] | None = None) -> Taps:
+    def scan(
+        self,
+        history: History,
+        first: Tensor,
+        links: tuple[Link, ...] | None = None,
+        memories: bool = True,
+    ) -> Taps:
         """Signals and memories in each row of a history whose runs begin at `first`, (R, m).
 
-        links: the links to pass; default all.
+        links: the links to pass; default all. memories: whether those of effects are kept where
+        there are very many rows; they are by far the largest part.
         """
         start = self.standing(first, signals=False)[0].memory
-        mode = Scanning(start, context_of(history), history=history)
+        mode = Scanning(start, context_of(history), history=history, keeps=memories)
         behind: dict[Stage, Tensor] = {}
         signal = self.walk(Signal(history.pressure), mode, links, behind)
         return Taps(*signal.behind_chambers(), mode.memory, behind)
+
+    @torch.no_grad()
+    def inputs(self, history: History, first: Tensor) -> tuple[Tensor, Tensor]:
+        """(R, T, m) actuation and direction of change that the network sees along a history.
+
+        first: (R, m) actuation at which each run begins. Memories are followed and not kept.
+        """
+        start = self.standing(first, signals=False)[0].memory
+        mode = Scanning(start, context_of(history), history=history, keeps=False)
+        signal = self.walk(Signal(history.pressure), mode, self.inner)
+        return signal.value, signal.behind_chambers()[1]
 
     def hold(self, pressure: Tensor, direction: Tensor, memory: dict[str, Tensor]) -> Tensor:
         """Key points (..., n, 3) in mm behind the network, of given memories.

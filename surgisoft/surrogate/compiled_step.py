@@ -19,6 +19,9 @@ from surgisoft.surrogate.effects.hysteresis import Hysteresis
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import HawNN
 
+LANES = 16
+"""Numbers of float32 in the widest vectors of x86-64 (AVX-512)."""
+
 
 class CompiledStep:
     """Steps of one arm model on the CPU, without gradients.
@@ -31,9 +34,11 @@ class CompiledStep:
     ):
         """Parts of the model: network, and name and effect of its hysteresis, None without."""
         self.model, self.name, self._network, self._hysteresis = model, name, network, hysteresis
+        *self._hidden, self._out = network.layers
         self._tensors = [*model.parameters(), *model.buffers()]
         self._seen: list[tuple[int, int]] = []
         self._constants: list[np.ndarray] = []
+        self._last: tuple[Tensor, Tensor] | None = None
 
     @classmethod
     def of(cls, model: ArmModel) -> CompiledStep | None:
@@ -60,33 +65,56 @@ class CompiledStep:
     def __call__(self, state: ArmState, pressure: Tensor) -> tuple[ArmState, Tensor]:
         """State and key points (B, n, 3) mm, base frame, after a step at `pressure` (B, m)."""
         network = self._network
+        state, x = self._followed(state, pressure)
+        for layer in self._hidden:
+            if isinstance(layer, nn.Linear):
+                x = torch.addmm(layer.bias, x, layer.weight.t())
+            else:
+                x = nn.functional.silu(x, inplace=True)
+        assert self._last is not None
+        x = torch.addmm(self._last[1], x, self._last[0])[:, : len(network.mean)]
+        points = torch.addcmul(network.mean, x, network.scale)
+        return state, points.view(len(pressure), network.key_points, 3)
+
+    @torch.no_grad()
+    def follow(self, state: ArmState, pressure: Tensor) -> ArmState:
+        """State after a step at `pressure` (B, m), where nobody asks for its key points."""
+        return self._followed(state, pressure)[0]
+
+    def _followed(self, state: ArmState, pressure: Tensor) -> tuple[ArmState, Tensor]:
+        """State after a step at `pressure` (B, m), and the network's inputs (B, m or 2 m) there."""
         count, chambers = pressure.shape
         memory = pressure.new_empty(count, 0) if self.name is None else state.memory[self.name]
         after, anchor = torch.empty_like(memory), torch.empty_like(pressure)
         direction = torch.empty_like(pressure)
-        x = pressure.new_empty(count, chambers * (2 if network.directions else 1))
+        x = pressure.new_empty(count, chambers * (2 if self._network.directions else 1))
         arrays = [
             _array(t) for t in (pressure, state.anchor, state.direction, anchor, direction, x)
         ]
         seen = [(t.data_ptr(), 0 if t.is_inference() else t._version) for t in self._tensors]
         if seen != self._seen:
-            self._seen, self._constants = seen, self._read()
+            self._seen, self._constants, self._last = seen, self._read(), self._wide_last_layer()
         if self.name is None:
             _advance(*arrays, *self._constants)
         else:
             _advance_with_plays(*arrays, *self._constants, _array(memory), _array(after))
-        for layer in network.layers:
-            if isinstance(layer, nn.Linear):
-                x = torch.addmm(layer.bias, x, layer.weight.t())
-            else:
-                x = nn.functional.silu(x, inplace=True)
-        points = torch.addcmul(network.mean, x, network.scale).view(count, network.key_points, 3)
         held = {} if self.name is None else {self.name: after}
-        return ArmState(pressure, anchor, direction, held), points
+        return ArmState(pressure, anchor, direction, held), x
 
     def alone(self, state: ArmState, pressure: np.ndarray) -> LoneArmModel:
         """Steps of the one arm (B = 1) of a state; see `LoneArmModel`."""
         return LoneArmModel(self, state, pressure)
+
+    def _wide_last_layer(self) -> tuple[Tensor, Tensor]:
+        """Weights (i, o) and bias (o,) of the last layer, with zeros up to whole vectors.
+
+        A product with 15 outputs takes three times as long as one with 16.
+        """
+        layer = self._out
+        assert isinstance(layer, nn.Linear)
+        more = -layer.out_features % LANES
+        weight, bias = layer.weight.detach().t(), layer.bias.detach()
+        return nn.functional.pad(weight, (0, more)), nn.functional.pad(bias, (0, more))
 
     def _read(self) -> list[np.ndarray]:
         """Constants of the compiled loops."""
@@ -196,27 +224,32 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 
 def _plays(effect: Hysteresis) -> list[np.ndarray]:
-    """Constants of an effect's play operators: lines, radii, weights and slopes."""
+    """Constants of an effect's play operators: lines (m, L) and (m, m, L), and one after another
+    with zeros up to whole vectors (P,) the radii, (m, P) the weights and the slopes."""
     weight = effect.turned[effect.turns] if effect.ring else effect.weight
     slope = torch.zeros_like(weight) if effect.ring else effect.slope
-    origin = effect.lines(effect.origin)
-    parts = (effect.centre, effect.half_range, effect.use, effect.linear, effect.bent, origin)
-    return [_array(t) for t in (*parts, effect.radius, weight, slope)]
+    origin, more = effect.lines(effect.origin), (0, -weight[0].numel() % LANES)
+    radius = nn.functional.pad(effect.radius.repeat(len(origin)), more)
+    wide = [nn.functional.pad(t.flatten(1), more) for t in (weight, slope)]
+    lines = effect.linear.movedim(0, -1), effect.bent.movedim(0, -1)
+    parts = (effect.centre, effect.half_range, effect.use, *lines, origin)
+    return [_array(t) for t in (*parts, radius, *wide)]
 
 
 @compiled
-def _direct(b, m, pressure, anchor, direction, new_anchor, new_direction, still, idle, band):
-    """Chamber pressure, and the direction of change after the step; see `scan.direction_step`."""
-    chamber = idle[m] if still[m] else pressure[b, m]
-    moved = min(max(anchor[b, m], chamber - band[m]), chamber + band[m])
-    new_anchor[b, m] = moved
-    if moved > anchor[b, m]:
-        new_direction[b, m] = np.float32(1.0)
-    elif moved < anchor[b, m]:
-        new_direction[b, m] = np.float32(-1.0)
-    else:
-        new_direction[b, m] = direction[b, m]
-    return chamber
+def _direct(pressure, anchor, direction, still, idle, band):
+    """Chamber pressure, confirmed pressure and direction of one chamber after a step; see
+    `scan.direction_step`.
+
+    Numbers in, numbers out: a compiled call with arrays costs 80 ns, by the counts of references.
+    """
+    chamber = idle if still else pressure
+    moved = min(max(anchor, chamber - band), chamber + band)
+    if moved > anchor:
+        direction = np.float32(1.0)
+    elif moved < anchor:
+        direction = np.float32(-1.0)
+    return chamber, moved, direction
 
 
 @compiled
@@ -238,15 +271,15 @@ def _advance(
     count, chambers = pressure.shape
     for b in range(count):
         for m in range(chambers):
-            chamber = _direct(
-                b, m, pressure, anchor, direction, new_anchor, new_direction, still, idle, band
+            chamber, new_anchor[b, m], new_direction[b, m] = _direct(
+                pressure[b, m], anchor[b, m], direction[b, m], still[m], idle[m], band[m]
             )
             x[b, m] = (chamber - centre[m]) / half_range[m]
             if x.shape[1] > chambers:
                 x[b, chambers + m] = new_direction[b, m] * use[m]
 
 
-@compiled
+@compiled(reorder=True)
 def _advance_with_plays(
     pressure,
     anchor,
@@ -272,38 +305,46 @@ def _advance_with_plays(
     memory,
     after,
 ):
-    """As `_advance` for arms with hysteresis: memory (B, L, J) to after; see `Hysteresis`."""
+    """As `_advance` for arms with hysteresis: memory (B, L, J) to after; see `Hysteresis`.
+
+    The constants are those of `_plays`; all play operators of an arm are one loop.
+    """
     count, chambers = pressure.shape
-    lines, radii = len(linear), len(radius)
+    lines, radii, plays = memory.shape[1], memory.shape[2], memory.shape[1] * memory.shape[2]
+    held, moved = memory.reshape(count, plays), after.reshape(count, plays)
     chamber, scaled = np.empty(chambers, np.float32), np.empty(chambers, np.float32)
-    shift = np.empty(chambers, np.float32)
-    lags = np.empty(radii, np.float32)
+    load, mixed = np.empty(lines, np.float32), np.empty(lines, np.float32)
+    wide, away = np.empty(plays, np.float32), np.empty(plays, np.float32)
+    lag, sloped = np.zeros(len(radius), np.float32), np.zeros(len(radius), np.float32)
     for b in range(count):
         for m in range(chambers):
-            chamber[m] = _direct(
-                b, m, pressure, anchor, direction, new_anchor, new_direction, still, idle, band
+            chamber[m], new_anchor[b, m], new_direction[b, m] = _direct(
+                pressure[b, m], anchor[b, m], direction[b, m], still[m], idle[m], band[m]
             )
             scaled[m] = (chamber[m] - play_centre[m]) / play_half[m] * play_use[m]
-            shift[m] = np.float32(0.0)
-        for line in range(lines):
-            u = np.float32(0.0)
-            for m in range(chambers):
-                mixed = linear[line, m]
-                for other in range(chambers):
-                    mixed += bent[line, m, other] * scaled[other]
-                u += mixed * scaled[m]
-            away = u - origin[line]
-            for j in range(radii):
-                value = min(max(memory[b, line, j], u - radius[j]), u + radius[j])
-                after[b, line, j] = value
-                lags[j] = value - u
-            for m in range(chambers):
-                total = np.float32(0.0)
-                for j in range(radii):
-                    total += (weight[m, line, j] + slope[m, line, j] * away) * lags[j]
-                shift[m] += total
+        load[:] = np.float32(0.0)
         for m in range(chambers):
-            effective = chamber[m] + play_half[m] * shift[m]
+            mixed[:] = linear[m]
+            for other in range(chambers):
+                for line in range(lines):
+                    mixed[line] += bent[m, other, line] * scaled[other]
+            for line in range(lines):
+                load[line] += mixed[line] * scaled[m]
+        for line in range(lines):
+            for j in range(radii):
+                wide[line * radii + j] = load[line]
+                away[line * radii + j] = load[line] - origin[line]
+        for i in range(plays):
+            u = wide[i]
+            value = min(max(held[b, i], u - radius[i]), u + radius[i])
+            moved[b, i] = value
+            lag[i] = value - u
+            sloped[i] = away[i] * (value - u)
+        for m in range(chambers):
+            shift = np.float32(0.0)
+            for i in range(len(lag)):
+                shift += weight[m, i] * lag[i] + slope[m, i] * sloped[i]
+            effective = chamber[m] + play_half[m] * shift
             x[b, m] = (effective - centre[m]) / half_range[m]
             if x.shape[1] > chambers:
                 x[b, chambers + m] = new_direction[b, m] * use[m]

@@ -244,6 +244,15 @@ class ArmModel(nn.Module):
         chain = self.chain
         return chain.scan(history, self.first_pressure(history), chain.inner)
 
+    @property
+    def row_wise(self) -> bool:
+        """Whether the key points of a row follow from what the network sees in it (`inputs`)."""
+        return not (self.remembers or self.chain.outer)
+
+    def inputs(self, history: History) -> tuple[Tensor, Tensor]:
+        """(R, T, m) actuation and direction of change that the network sees in each row."""
+        return self.chain.inputs(history, self.first_pressure(history))
+
     def shape(self, pressure: Tensor, direction: Tensor, memory: dict[str, Tensor]) -> Tensor:
         """Key points (..., n, 3) in mm before body and sensor effects, of a static network.
 
@@ -253,11 +262,14 @@ class ArmModel(nn.Module):
 
     def predict(self, history: History) -> Tensor:
         """Key points (R, T, n, 3) in mm, base frame, for whole runs; padding rows are void."""
-        return self.scan(history).behind["sensor"]
+        return self.scan(history, memories=False).behind["sensor"]
 
-    def scan(self, history: History) -> Taps:
-        """Signals behind each stage, key points too, and memories in each row of a history."""
-        return self.chain.scan(history, self.first_pressure(history))
+    def scan(self, history: History, memories: bool = True) -> Taps:
+        """Signals behind each stage, key points too, and memories in each row of a history.
+
+        memories: whether those are kept where there are very many rows.
+        """
+        return self.chain.scan(history, self.first_pressure(history), memories=memories)
 
     @property
     def states_interval(self) -> bool:

@@ -33,6 +33,30 @@ def clamp_loop(low: np.ndarray, high: np.ndarray, start: np.ndarray, out: np.nda
 
 
 @compiled
+def play_loop(signal: np.ndarray, radius: np.ndarray, start: np.ndarray, out: np.ndarray) -> None:
+    """`clamp_loop` between signal - radius and signal + radius, for signals that share radii.
+
+    signal (R, T, ...), radius (J,), start (R, ..., J) and out (R, T, ..., J).
+    """
+    runs, steps, radii = out.shape[0], out.shape[1], len(radius)
+    loads = signal.reshape(runs, steps, -1)
+    plays = out.reshape(runs, steps, -1, radii)
+    first = start.reshape(runs, -1, radii)
+    for r in range(runs):
+        before = first[r]
+        for t in range(steps):
+            after = plays[r, t]
+            for c in range(loads.shape[2]):
+                load = loads[r, t, c]
+                for j in range(radii):
+                    last, bottom, top = before[c, j], load - radius[j], load + radius[j]
+                    value = last if last > bottom else bottom
+                    value = value if value < top else top
+                    after[c, j] = value if last == last and bottom == bottom else last + bottom
+            before = after
+
+
+@compiled
 def linear_loop(factor: np.ndarray, addend: np.ndarray, start: np.ndarray, out: np.ndarray) -> None:
     """y[r, t, c] = factor y[r, t - 1, c] + addend into out; start (R, C), the rest (R, T, C)."""
     for r in range(out.shape[0]):
@@ -55,6 +79,27 @@ def _looped(loop, bands: tuple[Tensor, Tensor], start: Tensor) -> Tensor | None:
     rows = [p.detach().reshape(*shape[:2], -1).numpy() for p in bands]
     first = start.detach().expand(shape[0], *shape[2:]).reshape(shape[0], -1).numpy()
     loop(*rows, first, out.view(*shape[:2], -1).numpy())
+    return out
+
+
+def stepped(
+    loop: Callable[..., None],
+    rows: tuple[Tensor, ...],
+    constants: tuple[Tensor, ...],
+    start: Tensor,
+) -> Tensor | None:
+    """A memory (R, T, ...) that a compiled loop steps; None where that does not apply.
+
+    It does not with gradients or on another device. loop: function of rows (R, T, ...), constants,
+    memory before the first row (R, ...) and the array that it fills.
+    """
+    parts = (*rows, *constants, start)
+    wanted = torch.is_grad_enabled() and any(part.requires_grad for part in parts)
+    plain = all(p.device.type == "cpu" and p.dtype == start.dtype for p in parts)
+    if wanted or not plain or start.dtype not in (torch.float32, torch.float64):
+        return None
+    out = start.new_empty(*rows[0].shape[:2], *start.shape[1:])
+    loop(*(p.detach().contiguous().numpy() for p in parts), out.numpy())
     return out
 
 
@@ -89,8 +134,12 @@ def play_scan(signal: Tensor, radius: Tensor, start: Tensor) -> Tensor:
     a play last moved, at step s, it is u[s] -+ r, so its gradient is that of a gather at s, and
     that of the start where it has not moved yet.
     """
+    plays = None
+    if radius.ndim == 1 and signal.ndim > 2 and signal.stride(-1) == 0:
+        # Plays of several radii on one signal: nothing as large as the result is made beside it.
+        plays = stepped(play_loop, (signal[..., 0],), (radius,), start)
     with torch.no_grad():
-        plays = clamp_scan(signal - radius, signal + radius, start)
+        plays = clamp_scan(signal - radius, signal + radius, start) if plays is None else plays
     if not (torch.is_grad_enabled() and (signal.requires_grad or start.requires_grad)):
         return plays
     moved = plays != torch.cat([start.detach().unsqueeze(1), plays[:, :-1]], dim=1)

@@ -2,13 +2,17 @@
 
 A new task is one file and one line in `TASKS`. Training presets, the promises in
 `tests/tasks/test_tasks.py` and the reference in the docs follow from that line; the Gymnasium id of
-a task of one agent follows from its name in `surgisoft.environments.ONE_AGENT`.
+a task of one agent follows from its name in `surgisoft.environments.ONE_AGENT`. A task in another
+package is a `TaskSpec` in the entry point group `surgisoft.tasks`.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
+import sys
 from collections.abc import Mapping
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
@@ -47,11 +51,47 @@ MOST_STEPS = 10_000_000
 """Most steps of an episode: eleven days at 0.1 s."""
 
 
+GROUP = "surgisoft.tasks"
+"""Entry point group of tasks in other packages."""
+
+
+def task_names() -> list[str]:
+    """Names of all tasks: those of this package, then those that installed packages offer."""
+    return [*TASKS, *(name for name in _offered(tuple(sys.path)) if name not in TASKS)]
+
+
 def spec_of(task: str) -> TaskSpec:
     """The named task's entry; an unknown name raises an InputError that lists the known ones."""
-    if task not in TASKS:
-        raise unknown_name("task", task, TASKS)
-    return TASKS[task]
+    if task in TASKS:
+        return TASKS[task]
+    entry = _offered(tuple(sys.path)).get(task)
+    if entry is None:
+        raise unknown_name("task", task, task_names())
+    return _loaded(entry)
+
+
+@functools.cache
+def _offered(path: tuple[str, ...]) -> dict[str, EntryPoint]:
+    """Entry points of tasks by name while the search path is this one; none is loaded."""
+    return {entry.name: entry for entry in entry_points(group=GROUP)}
+
+
+@functools.cache
+def _loaded(entry: EntryPoint) -> TaskSpec:
+    """The task of an installed package."""
+    label = f"task '{entry.name}' ({entry.value})"
+    try:
+        spec = entry.load()
+    except Exception as error:
+        raise InputError(
+            f"{label}: does not load ({type(error).__name__}: {str(error)[:120]}); correct or "
+            "remove that package"
+        ) from error
+    if not isinstance(spec, TaskSpec):
+        raise InputError(
+            f"{label}: is a {type(spec).__name__}, expected a surgisoft.tasks.spec.TaskSpec"
+        )
+    return spec
 
 
 def make_task(name: str, config: Any = None, device: str | torch.device = "cpu") -> DocumentedTask:
@@ -63,6 +103,8 @@ def make_task(name: str, config: Any = None, device: str | torch.device = "cpu")
     try:
         task = spec.build(spec.config if config is None else config, device)
         steps = task.steps
+        if task.name != name:  # of another package
+            raise InputError(f"task '{name}': its name is '{task.name}', expected '{name}'")
     except OverflowError:  # a time over dt_s is infinite
         steps = MOST_STEPS + 1
     if steps > MOST_STEPS:

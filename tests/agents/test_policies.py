@@ -1,10 +1,17 @@
 """Drivers by name, and what they promise."""
 
+import math
+
 import pytest
 import torch
 
 from surgisoft.agents.policies import Random, open_policy
-from surgisoft.agents.policy_network import ScaledActor, empty_actor
+from surgisoft.agents.policy_network import (
+    CompiledTanh,
+    ScaledActor,
+    compile_activations,
+    empty_actor,
+)
 from surgisoft.agents.presets import Preset
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Episodes
@@ -64,3 +71,25 @@ def test_outputs_are_scaled_and_clipped_to_the_pumps_step():
     found = ScaledActor(actor, preset.action_kPa, 0.4)(seen)
     torch.testing.assert_close(found, (2.5 * plain).clamp(-0.4, 0.4))
     assert (2.5 * plain).abs().min() < 0.4 < plain.abs().max()
+
+
+def test_compiled_tanh_is_tanh_and_so_is_its_gradient():
+    x = torch.linspace(-12.0, 12.0, 4001, requires_grad=True)
+    y = CompiledTanh()(x)
+    (slope,) = torch.autograd.grad(y.sum(), x)
+    truth = x.detach().double().tanh()
+    assert (y.detach() - truth).abs().max() < 1e-6
+    assert (slope - (1.0 - truth.square())).abs().max() < 2e-6
+    odd = torch.tensor([math.nan, math.inf, -math.inf, 0.0, 1e-30])
+    assert torch.allclose(CompiledTanh()(odd)[1:], odd.tanh()[1:], rtol=1e-6, atol=0.0)
+    assert CompiledTanh()(odd)[0].isnan()
+
+
+def test_a_training_computes_every_tanh_by_the_compiled_one(task):
+    actor = empty_actor("arm", 5, 3, Preset(hidden=(8, 8)))
+    seen = torch.randn(7, 5, generator=torch.Generator().manual_seed(0))
+    before, names = actor.mlp(seen), list(actor.state_dict())
+    compile_activations(actor)
+    assert [type(layer) for layer in actor.mlp].count(CompiledTanh) == 2
+    assert list(actor.state_dict()) == names
+    assert torch.allclose(actor.mlp(seen), before, atol=1e-5)

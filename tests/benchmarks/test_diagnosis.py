@@ -2,8 +2,10 @@
 
 import itertools
 import json
+import os
 import shutil
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -173,14 +175,39 @@ def test_a_run_goes_on_where_it_was_cut_off(folder, monkeypatch):
     """A kept outcome is taken as it is; one that lacks its amendment is made again."""
     some = [replace(CLEAN, hidden=(("creep", 1.0),)), CLEAN]
     kept = [said(some[0], "identified", ("creep",), 0.9), said(some[1], "ambiguous", ("x",), 0.5)]
+    asked = []
+
+    def quick(case, place, amending):
+        asked.append((case, place, amending))
+        return replace(kept[0], case=case, amended=Amended(("creep",), 0.6, 0.2, 0.1))
+
+    monkeypatch.setattr(diagnosis, "run_case", quick)
+    monkeypatch.setattr(diagnosis, "workers", ThreadPoolExecutor)
     monkeypatch.setattr(diagnosis, "fingerprint", lambda: "x")
     log = folder / "outcomes-x.jsonl"
     log.write_text("".join(json.dumps(asdict(o)) + "\n" for o in kept))
     assert run(some, folder, 1, lambda *_: None) == kept
+    assert not asked
     again = run(some, folder, 1, lambda *_: None, amend=1)
     assert again[0].amended is not None
     assert again[1] == kept[1]
     assert run(some, folder, 1, lambda *_: None, amend=1) == again
+    assert asked == [(some[0], folder, True)]
+
+
+def test_processes_of_their_own_run_the_cases(folder, tmp_path, monkeypatch):
+    """What a process needs goes there and what it finds comes back; here without a diagnosis."""
+    shutil.copytree(folder / "robot-0", tmp_path / "robot-0")
+    monkeypatch.setattr(diagnosis, "run_case", in_another_process)
+    (found,) = run([CLEAN], tmp_path, 1, lambda *_: None)
+    assert found == replace(said(CLEAN, "identified", ("creep",), 0.9), effects=found.effects)
+    assert found.effects != (str(os.getpid()),)
+
+
+def in_another_process(case, place, amending):
+    """In place of a diagnosis: an outcome that names the process it was made in."""
+    assert (place / "robot-0" / "config.json").is_file()
+    return replace(said(case, "identified", ("creep",), 0.9), effects=(str(os.getpid()),))
 
 
 def test_each_effect_is_amended_once_before_any_twice():

@@ -3,6 +3,8 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -311,11 +313,50 @@ def test_next_experiment_records_on_a_simulated_rig_and_asks_a_person_at_a_real_
     assert run([*command, "--rig", "virtual:seed=3"]) == 0
     recording = load_recording(new)
     assert recording.gravity == pytest.approx([0.0, -0.42, 0.9075], abs=1e-3), "rolled by 90 deg"
+    said = capsys.readouterr().out
+    assert f"then: surgisoft diagnose default {new}" in said, "the file that was just recorded"
+    assert "surgisoft collect" not in said, "it is done"
+    assert run([*command[:-2], "--rig", "tests.rig.own_rig:OwnRig:port=x"]) == 0
+    said = capsys.readouterr().out
+    assert f"on the rig: surgisoft collect {plan} --rig tests.rig.own_rig:OwnRig:port=x" in said
+    assert "virtual" not in said
+
+
+def test_time_on_the_bench_where_the_clock_begins_anew_with_each_run():
+    from surgisoft.cli.collect import written_line
+
+    def line(t_s):
+        recording = SimpleNamespace(
+            t_s=np.array(t_s), noise_mm=None, samples=len(t_s), kind="continuous", chambers=3,
+            key_points=5, runs=[0, 1],
+        )  # fmt: skip
+        return written_line(Path("a.parquet"), recording)
+
+    assert "2 runs, 50 s on the bench" in line([0.0, 20.0, 0.0, 30.0])
+    assert "2 runs, 4 min on the bench" in line([10.0, 100.0, 130.0, 240.0])
+
+
+def test_many_pictures_are_one_line(tmp_path, capsys):
+    from surgisoft.cli.files import show_written
+
+    few = [tmp_path / "a.png", tmp_path / "b.png"]
+    many = [tmp_path / "pictures" / f"{k}.svg" for k in range(5)]
+    show_written([*many, tmp_path / "report.html", *few])
+    assert capsys.readouterr().out.splitlines() == [
+        f"wrote {tmp_path / 'report.html'}: open it in a browser",
+        f"wrote {few[0]}",
+        f"wrote {few[1]}",
+        f"wrote 5 pictures to {tmp_path / 'pictures'}",
+    ]
+
+
+def test_a_run_too_short_for_its_detector_names_the_option(tmp_path, capsys):
+    command = f"run mixed -o {tmp_path / 'run.parquet'} --clean 20 --clock simulated"
+    assert run(command.split()) == 2
+    assert "--clean 20: expected at least" in capsys.readouterr().err
 
 
 def test_an_interrupted_experiment_says_how_to_go_on(tmp_path, monkeypatch, capsys):
-    from types import SimpleNamespace
-
     from surgisoft.experiments import session
 
     def interrupted(*_):

@@ -377,6 +377,8 @@ def test_a_damaged_asset_is_refused_in_one_line(tmp_path, change, told):
             "'other' is not",
         ),
         (lambda v: v.update(wrong_unknown=None), "wrong_unknown is no finite number"),
+        (lambda v: v.update(wrong_unknown=10**400), "wrong_unknown is no finite number"),
+        (lambda v: v.update(calibration="name"), "calibration is no table"),
     ],
 )
 def test_an_asset_with_its_hash_but_no_numbers_is_refused(tmp_path, change, told):

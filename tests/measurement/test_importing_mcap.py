@@ -2,6 +2,7 @@
 
 import json
 import struct
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -241,12 +242,46 @@ def test_lengths_that_a_file_claims_take_no_memory(tmp_path, bag):
     while whole[chunk] != 6:
         chunk += 9 + struct.unpack_from("<Q", whole, chunk + 1)[0]
     (summary,) = struct.unpack_from("<Q", whole, len(whole) - 8 - 20)
-    for at, said in ((summary + 1, "cannot be read"), (chunk + 9 + 16, "claims to unpack to")):
-        damaged = whole[:at] + struct.pack("<Q", 1 << 62) + whole[at + 8 :]
+    long_name = (1 << 32) - 1 << 32  # length of the compression's name, behind a checksum
+    for damages, said in (
+        ([(summary + 1, 1 << 62)], "cannot be read"),
+        ([(chunk + 9 + 16, 1 << 62)], "claims to unpack to"),
+        ([(chunk + 1, 1 << 62), (chunk + 9 + 24, long_name)], "cannot be read|no column"),
+    ):
+        damaged = bytearray(whole)
+        for at, number in damages:
+            struct.pack_into("<Q", damaged, at, number)
         (tmp_path / "bag.mcap").write_bytes(damaged)
+        tracemalloc.start()
         with pytest.raises(InputError, match=said) as caught:
             import_files([tmp_path / "bag.mcap"], load_map(str(tmp_path / "map.toml")), "r")
+        _, most = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
         assert not isinstance(caught.value.__cause__, MemoryError)
+        assert most < 1 << 27
+
+
+def frame_head(compression: str, size: int) -> bytes:
+    """Begin of a packed frame that claims to unpack to so many bytes."""
+    if compression == "zstd":  # magic number, "one segment, size in 8 bytes", the size (RFC 8878)
+        return struct.pack("<IBQ", 0xFD2FB528, 0xE0, size)
+    return pytest.importorskip("lz4.frame").LZ4FrameCompressor().begin(source_size=size)
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_what_a_packed_frame_claims_takes_no_memory(tmp_path, bag, compression):
+    """The chunk states a harmless size, and the frame inside, which the library goes by, 16 GB."""
+    text = MAP.replace("TOPICS", 'topic = "/tip"').replace("POSITIONS", "[['x', 'y', 'z']]")
+    (tmp_path / "map.toml").write_text(text)
+    frame = frame_head(compression, 1 << 34) + bytes(40)
+    name = compression.encode()
+    chunk = struct.pack("<QQQII", 0, 1, 1000, 0, len(name)) + name + struct.pack("<Q", len(frame))
+    chunk += frame
+    whole = bag.read_bytes()
+    record = struct.pack("<BQ", 6, len(chunk)) + chunk
+    (tmp_path / "bag.mcap").write_bytes(whole[:8] + record + whole[8:])
+    with pytest.raises(InputError, match="claims to unpack to 17179869184"):
+        import_files([tmp_path / "bag.mcap"], load_map(str(tmp_path / "map.toml")), "r")
 
 
 def test_a_clock_that_jumps_by_years_takes_no_memory(tmp_path):

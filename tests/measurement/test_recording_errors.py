@@ -1,6 +1,7 @@
 """Every bad recording gets one line: the file, the place, what came, what was expected."""
 
 import re
+import time
 
 import numpy as np
 import pyarrow as pa
@@ -254,6 +255,20 @@ def test_the_pages_of_a_parquet_file_cannot_claim_gigabytes(tmp_path, monkeypatc
     path.write_bytes(content)
     assert changed == len(names)
     assert f"claims pages of {2 * (2**20 - 1)} bytes" in error_of(path)
+
+
+def test_a_list_in_the_header_of_a_page_ends_with_the_file(tmp_path):
+    """A header may claim a list of 2**42 truth values, which take no time to pass over."""
+    path, names = tmp_path / "bad.parquet", HEAD.split(",")
+    table = pa.table([np.zeros(9)] * len(names), names=names)
+    pq.write_table(table, path, use_dictionary=False)
+    at = pq.read_metadata(path).row_group(0).column(0).data_page_offset
+    content = path.read_bytes()
+    listed = b"\x19\xf1" + b"\x80" * 6 + b"\x01"  # field 1: a list; its number, 7 bits a byte
+    path.write_bytes(content[:at] + listed + content[at + len(listed) :])
+    began = time.process_time()
+    assert "not a readable Parquet file" in error_of(path)
+    assert time.process_time() - began < 1.0
 
 
 @pytest.mark.parametrize("name", ["p" + "1" * 5000 + "_kPa", "k" + "9" * 5000 + "_x_mm"])

@@ -22,7 +22,7 @@ from surgisoft.replay.colours import (
     tissue_colours,
 )
 from surgisoft.replay.endoscope import PIXELS, camera_entity, cone_entity
-from surgisoft.replay.episode_view import legend, write_replay
+from surgisoft.replay.episode_view import hiding_bodies, legend, viewpoint, write_replay
 from surgisoft.replay.plots import plots_of
 from surgisoft.replay.surfaces import dosed_surface
 from surgisoft.replay.viewer import take_screenshot
@@ -324,3 +324,31 @@ def test_pressure_lines_are_named(log):
     by_entity = sorted(laser.lines, key=lambda line: line.entity)
     names = [line.name for line in by_entity]
     assert names == [f"{what} {i}" for what in ("chamber", "command") for i in (1, 2, 3)]
+
+
+def test_a_wall_in_front_of_the_work_is_see_through(log, tmp_path):
+    """A plate half-way between eye and lesion hides the work; one behind the lesion does not."""
+    assert hiding_bodies(log) == []
+    eye, _ = viewpoint(log)
+    middle = np.concatenate(log.paths_mm).mean(axis=0)
+    across = np.linalg.svd((middle - eye)[None])[2][1:]  # two directions at right angles to it
+    corners = 60.0 * np.array(
+        [-across[0] - across[1], across[0] - across[1], across[0] + across[1]]
+    )
+    faces = np.array([[0, 1, 2]])
+
+    def plate(name, share):
+        at = eye + share * (middle - eye) + corners
+        return replace(log.bodies[0], name=name, role="keep-out", vertices_mm=at, faces=faces)
+
+    walled = replace(log, bodies=(*log.bodies, plate("wall", 0.5), plate("table", 1.5)))
+    assert hiding_bodies(walled) == ["wall"]
+    assert "see-through**: wall" in legend(walled)
+    assert "see-through" not in legend(log)
+    written = write_replay(replace(walled, cameras={}), tmp_path / "walled.rrd")
+    opacity = {
+        name: column(written.path, f"/bodies/{name}", "Mesh3D:albedo_factor")[-1][0] & 255
+        for name in ("wall", "table")
+    }
+    assert opacity["table"] == 255
+    assert opacity["wall"] < 128

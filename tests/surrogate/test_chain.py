@@ -226,17 +226,26 @@ def test_long_recordings_are_followed_in_blocks_with_the_same_result(
         with torch.no_grad():
             taps = arm.chain.scan(wide, long)
             again = RepeatedScan(arm.chain, wide, long, set(names), some)()
+            bare = arm.chain.scan(wide, long, memories=False)
+            inputs = arm.chain.inputs(wide, long)
+            kept.append(set(bare.memory))
             seen = {n: taps.behind[e.stage] for n, e in arm.effects.items()}
             context = replace(context_of(wide), pressure=taps.pressure)
             there = {
                 n: memory_at(e, taps.memory[n][:, 0], seen[n], context, some)
                 for n, e in arm.effects.items()
             }
-        return {"points": taps.behind["sensor"], "again": again, **taps.memory}, there
+        found = {"points": taps.behind["sensor"], "again": again, **taps.memory}
+        found |= {"bare": bare.behind["sensor"], "actuation": inputs[0], "direction": inputs[1]}
+        assert torch.allclose(bare.behind["sensor"], taps.behind["sensor"], atol=2e-4)
+        assert torch.allclose(inputs[0], taps.behind["material"], atol=2e-5)
+        return found, there
 
+    kept: list[set[str]] = []
     whole, at_once = followed()
     monkeypatch.setattr(chain, "BLOCK_ROWS", rows)
     blocks, in_turn = followed()
+    assert kept == [set(names), set()]
     for one, other in ((whole, blocks), (at_once, in_turn)):
         assert one.keys() == other.keys()
         for name, values in one.items():

@@ -242,6 +242,7 @@ CONTRADICTIONS = {
     "the dose has an unknown zone": lambda log: with_dose(log, zone=log.dose.zone + 3),
     "on a face of a negative number": lambda log: with_dose(log, faces=-1 - log.dose.faces),
     "a limit that is not above 0": lambda log: with_dose(log, cut_j_per_mm2=0.0),
+    "lack the one of the clearance": lambda log: replace(log, limits={"time_s": 1.0}),
     "its rewards are no table": lambda log: replace(log, rewards=[1.0]),
     "is no number for each of": lambda log: replace(log, measures={"a": np.zeros(1)}),
 }

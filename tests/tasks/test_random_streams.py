@@ -12,6 +12,10 @@ from surgisoft.tasks.world.random_streams import Stream, streams
 LARGE = 2**64
 
 
+class OtherTensor(torch.Tensor):
+    """Tensors that the compiled loop does not take, as those of a GPU."""
+
+
 def splitmix64(seed: int, count: int) -> list[int]:
     """The reference algorithm in whole numbers (Steele, Lea & Flood 2014, fig. 17)."""
     state, answer = seed % LARGE, []
@@ -35,6 +39,8 @@ def test_numbers_are_those_of_splitmix64(seed, count):
     after, values = stream.uniform(0.0, 1.0, count)
     expected = [(z >> 40) / 2**24 for z in splitmix64(seed, count)]
     assert values[0].tolist() == expected
+    plain = Stream(stream.key.as_subclass(OtherTensor), stream.count)
+    assert plain.uniform(0.0, 1.0, count)[1][0].tolist() == expected
     assert after.count.item() == count
 
 

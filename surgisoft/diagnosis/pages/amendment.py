@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -97,6 +98,10 @@ def parameter_table(parameters: tuple[Parameter, ...]) -> Table:
     return Table(header, rows)
 
 
+BROAD_PX = 560
+"""Width below which a chart over time scrolls, pixels."""
+
+
 def track_charts(tracks: dict[str, Track], floor_mm: float) -> list[Picture]:
     """A chart of each track by its caption, all with one scale of the error.
 
@@ -117,7 +122,7 @@ def track_charts(tracks: dict[str, Track], floor_mm: float) -> list[Picture]:
             axis.set_ylabel("error [mm]")
             axis.set_ylim(0, 1.05 * most)
             figure.legend(loc="outside lower center", ncols=3)
-            pictures.append(chart(figure, caption, caption))
+            pictures.append(replace(chart(figure, caption, caption), least_px=BROAD_PX))
     return pictures
 
 

@@ -178,7 +178,7 @@ def _worst(result: Comparison) -> Section:
 DRAWN_SHARE = 0.02
 """Smallest share of the error for which an axis gets a chart; the table lists all of them."""
 LEAST_AXES = 3
-"""Axes that are drawn where no share is so large."""
+"""Number of axes that are drawn where no share reaches `DRAWN_SHARE`."""
 COLOURS = (BLUE, RED, GREEN, AMBER, "#8a6fc7", "#48a9a6", "#b0627f", "#7d8b3a")
 CHAMBERS = COLOURS[2:]
 """Colours of chambers, apart from those of the error without and with an axis."""
@@ -188,16 +188,16 @@ IN_PLANE = COMPONENTS.index("in plane")
 def columns_of(result: Comparison, axis: str) -> dict[str, list[Band]]:
     """The bands of each column of an axis, by the column's title."""
     stem = NAMES.get(axis, f"{axis} ")
-    answer: dict[str, list[Band]] = {}
+    found: dict[str, list[Band]] = {}
     for band in result.bands:
         number = band.axis.removeprefix(stem)
         if band.axis == axis or (number != band.axis and number.isdigit()):
-            answer.setdefault(band.axis, []).append(band)
-    return answer
+            found.setdefault(band.axis, []).append(band)
+    return found
 
 
 def axis_charts(result: Comparison, unit: str) -> list[Picture]:
-    """A chart of each axis that the error was laid out on, the most telling first."""
+    """A chart of each axis that the error was laid out on, the one with the largest share first."""
     telling = [each.axis for each in result.axes if each.share >= DRAWN_SHARE]
     names = telling or [each.axis for each in result.axes[:LEAST_AXES]]
     names = names or [name for name in AXES if columns_of(result, name)]
@@ -263,7 +263,7 @@ def _of_chamber(profile: Profile) -> str:
 
 
 def _chart(result: Comparison, axis: str, unit: str) -> Picture:
-    """RMSE above, bias below, over an axis; shaded: 95 % intervals."""
+    """Chart of RMSE (above) and bias (below) over an axis; 95 % intervals are shaded."""
     from matplotlib import pyplot as plt
 
     found = columns_of(result, axis)
@@ -394,7 +394,8 @@ HOW_TOGETHER = (
     "from a bootstrap of blocks of time."
 )
 MOST_AXES = 3
-"""Axes over which several models are drawn, the most telling ones of the first model."""
+"""Number of axes over which several models are drawn: those with the largest shares of the first
+model's error."""
 POINTS = 900
 """Points of a line over time."""
 

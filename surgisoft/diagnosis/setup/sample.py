@@ -7,6 +7,7 @@ all else is a change of what was measured.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -110,6 +111,18 @@ class Sample:
 
     def predicted_single(self, arrangements: Sequence[Arrangement]) -> np.ndarray:
         """What `predicted` gives in single precision, in which models compute."""
+        wide = self._arranged(arrangements)
+        with torch.no_grad():
+            points = wide.rows(self.model.predict(wide)).numpy()
+        points[~np.isfinite(points)] = 0.0
+        return points.reshape(len(arrangements), -1, *points.shape[1:])
+
+    def along(self, arrangement: Arrangement) -> "RowPredictions":
+        """The prediction for single rows, if the channels drove the chambers so."""
+        return RowPredictions(self, arrangement)
+
+    def _arranged(self, arrangements: Sequence[Arrangement]) -> History:
+        """(A R, T) the thinned runs with the actuation of every arrangement."""
         history, cases = self.history, len(arrangements)
 
         def each(tensor: torch.Tensor) -> torch.Tensor:
@@ -124,7 +137,7 @@ class Sample:
             ]
             return torch.cat(parts)
 
-        wide = History(
+        return History(
             t_s=each(history.t_s),
             pressure=arranged(history.pressure),
             key_points=each(history.key_points[:, :, :0]),  # no prediction depends on them
@@ -133,16 +146,45 @@ class Sample:
             temperature_C=None if history.temperature_C is None else each(history.temperature_C),
             stood=None if history.stood is None else arranged(history.stood),
         )
-        with torch.no_grad():
-            points = wide.rows(self.model.predict(wide)).numpy()
-        points[~np.isfinite(points)] = 0.0
-        return points.reshape(cases, -1, *points.shape[1:])
 
     def without(self, lost: np.ndarray) -> "Sample":
         """The sample without key points where a mask (n,) holds."""
         return replace(
             self, points=tuple(np.where(lost[:, None], np.nan, part) for part in self.points)
         )
+
+
+class RowPredictions:
+    """Predicted key points of a sample's rows, mm; the network computes those that are asked for.
+
+    Memories follow every row. A network of whole runs, and effects behind the network, which may
+    remember key points, need every row computed.
+    """
+
+    def __init__(self, sample: Sample, arrangement: Arrangement):
+        self._sample, self._arrangement = sample, arrangement
+
+    @cached_property
+    def whole(self) -> np.ndarray:
+        """(S, n, 3) single precision, every row."""
+        return self._sample.predicted_single([self._arrangement])[0]
+
+    @cached_property
+    def _inputs(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """(S, m) each: what the network sees in every row."""
+        history = self._sample._arranged([self._arrangement])
+        actuation, direction = self._sample.model.inputs(history)
+        return history.rows(actuation), history.rows(direction)
+
+    def __call__(self, rows: np.ndarray) -> np.ndarray:
+        """(K, n, 3) single precision, of the rows (K,)."""
+        if "whole" in vars(self) or not self._sample.model.row_wise:
+            return self.whole[rows]
+        some, index = torch.from_numpy(rows), self._inputs
+        with torch.no_grad():
+            points = self._sample.model.network(index[0][some], index[1][some]).numpy()
+        points[~np.isfinite(points)] = 0.0
+        return points
 
 
 def sample_of(model: ArmModel, recordings: list[Recording], rows: int) -> Sample:
@@ -194,16 +236,28 @@ def samples_of(
 
 def interpolated(at: np.ndarray, times: np.ndarray, points: np.ndarray) -> np.ndarray:
     """(S, n, 3) of points (T, n, 3) at times at (S,), on lines between rows; NaN beyond them."""
+    first, second, share = neighbours(at, times)
+    return between(points[first], points[second], share)
+
+
+def neighbours(at: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(S,) each: the rows of times (T,) before and after times at (S,), and the share of the way
+    from one to the other; outside of 0 to 1 beyond the rows."""
     if len(times) < 2:
-        inside = np.abs(at - times[0]) < 1e-9
-        return np.where(inside[:, None, None], points[np.zeros(len(at), int)], np.nan)
+        only = np.zeros(len(at), int)
+        return only, only, np.where(np.abs(at - times[0]) < 1e-9, 0.0, -1.0)
     after = np.clip(np.searchsorted(times, at - 1e-9), 1, len(times) - 1)
     share = (at - times[after - 1]) / (times[after] - times[after - 1])
-    share = np.where(np.abs(share - np.round(share)) < 1e-6, np.round(share), share)
-    first, second = (
-        points[after - 1].astype(float, copy=False),
-        points[after].astype(float, copy=False),
+    return (
+        after - 1,
+        after,
+        np.where(np.abs(share - np.round(share)) < 1e-6, np.round(share), share),
     )
+
+
+def between(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """(S, n, 3) on the way from first to second (S, n, 3) at shares (S,); NaN beyond them."""
+    first, second = first.astype(float, copy=False), second.astype(float, copy=False)
     part = share[:, None, None]
     # A row that is met exactly does not need its neighbour, which may be missing.
     found = np.where(part == 0, first, np.where(part == 1, second, first + part * (second - first)))

@@ -7,7 +7,7 @@ on blocks of time that took no part in the fit. The combination with the fewest 
 well as any is taken, and then has to prove itself (`Proof`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -26,7 +26,13 @@ from surgisoft.diagnosis.setup.alignment import (
     unturned,
 )
 from surgisoft.diagnosis.setup.arrangements import EXHAUSTIVE, improved, proposed
-from surgisoft.diagnosis.setup.sample import Arrangement, Sample, interpolated
+from surgisoft.diagnosis.setup.sample import (
+    Arrangement,
+    RowPredictions,
+    Sample,
+    between,
+    neighbours,
+)
 from surgisoft.surrogate.effects.misalignment import Misalignment
 from surgisoft.surrogate.model import ArmModel
 
@@ -259,7 +265,7 @@ class Search:
         self.chambers = coarse.history.chambers
         self._measured = fine.measured()[0]
         self._predicted: dict[Arrangement, np.ndarray] = {}
-        self._whole: dict[Arrangement, np.ndarray] = {}
+        self._whole: dict[Arrangement, RowPredictions] = {}
 
     @cached_property
     def raw(self) -> Fitted:
@@ -435,23 +441,27 @@ class Search:
             self._predicted[arrangement] = self.fine.predicted([arrangement])[0]
         return self._predicted[arrangement]
 
-    def _full(self, arrangement: Arrangement) -> np.ndarray:
-        """(N, n, 3) prediction for every row in single precision, mm."""
+    def _full(self, arrangement: Arrangement) -> RowPredictions:
+        """Prediction for any of all rows."""
         if arrangement not in self._whole:
-            self._whole[arrangement] = self.full.predicted_single([arrangement])[0]
+            self._whole[arrangement] = self.full.along(arrangement)
         return self._whole[arrangement]
 
-    def _late(self, predicted: np.ndarray, later_s: float) -> np.ndarray:
-        """(S, n, 3) prediction of every row (N, n, 3), as it was `later_s` before the fine rows.
+    def _late(self, predicted: Callable[[np.ndarray], np.ndarray], later_s: float) -> np.ndarray:
+        """(S, n, 3) prediction, as it was `later_s` before the fine rows.
 
-        The prediction is what is interpolated: it has no noise that interpolation would lessen.
+        predicted: gives the key points (K, n, 3) of any of all rows (K,). The prediction is what is
+        interpolated: it has no noise that interpolation would lessen.
         """
         parts, begin = [], 0
         for at, times in zip(self.fine.at, self.full.at, strict=True):
-            part = predicted[begin : begin + len(times)]
+            first, second, share = neighbours(at - later_s, times)
+            parts.append((begin + first, begin + second, share))
             begin += len(times)
-            parts.append(interpolated(at - later_s, times, part))
-        return np.concatenate(parts)
+        first, second, share = (np.concatenate(each) for each in zip(*parts, strict=True))
+        rows, place = np.unique(np.concatenate([first, second]), return_inverse=True)
+        points = predicted(rows)
+        return between(points[place[: len(first)]], points[place[len(first) :]], share)
 
     def _at(self, hypothesis: Hypothesis, predicted: np.ndarray, spread: float = 0.0) -> Fitted:
         """The hypothesis with its frame fitted, for a prediction (S, n, 3) at its time."""
@@ -607,7 +617,7 @@ class Search:
         late_s: the whole delay; rows too near to the begin of a run to know what came before them
         take no part, the same for every mixture. tau_s: time constant of the lags together.
         """
-        full, parts, begin = self._full(hypothesis.arrangement), [], 0
+        full, parts, begin = self._full(hypothesis.arrangement).whole, [], 0
         for times in self.full.at:
             part = full[begin : begin + len(times)].astype(float)
             begin += len(times)
@@ -616,7 +626,7 @@ class Search:
                 lagged = _first_order(part.reshape(len(part), -1), step, tau_s / lags)
                 part = lagged.reshape(part.shape)
             parts.append(part)
-        late = self._late(np.concatenate(parts), pure_s)
+        late = self._late(np.concatenate(parts).__getitem__, pure_s)
         late[self._early(LAG_MARGIN * late_s)] = np.nan
         return self._at(replace(hypothesis, later_s=pure_s), late).losses
 

@@ -19,11 +19,14 @@ is integrated exactly, the chamber by the exponential midpoint rule (Hochbruck &
 which is exact where s is constant and never overshoots.
 """
 
+import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from surgisoft.compiled import compiled
 from surgisoft.surrogate.effects.base import (
     ArmFacts,
     Context,
@@ -34,7 +37,7 @@ from surgisoft.surrogate.effects.base import (
     value_of,
 )
 from surgisoft.surrogate.effects.hypothesis import Hypothesis, no_combinations
-from surgisoft.surrogate.scan import follow, linear_scan
+from surgisoft.surrogate.scan import follow, linear_scan, stepped
 
 CHAIN = 3
 """Lags that make up the dead time."""
@@ -156,12 +159,14 @@ class LineLag(Effect):
 
     def scan(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
         """(R, T, m, 1 + CHAIN) pressures along the command (R, T, m)."""
-        keep = self._keep(context.dt_s)
+        keep, flow = self._keep(context.dt_s), self._flow(context.dt_s)
+        out = stepped(_fill, (signal, keep, flow.up, flow.down), flow[2:], memory)
+        if out is not None:
+            return out
         chain, before = [], signal
         for link in memory[..., 1:].unbind(-1):
             before = linear_scan(keep, (1 - keep) * before, link)
             chain.append(before)
-        flow = self._flow(context.dt_s)
         chamber = follow(flow.decayed, before, memory[..., 0], TOLERANCE * self.reach)
         return torch.stack([chamber, *chain], dim=-1)
 
@@ -188,6 +193,32 @@ class LineLag(Effect):
             Quantity("dead_s", value_of(self.log_dead.exp()), "s", 0.0, 2.0, tube),
             Quantity("turn", value_of(self.log_turn.exp()), "", 0.0, 1e4, both),
         ]
+
+
+@compiled
+def _fill(signal, keep, up, down, turn, usual, memory, out):
+    """Step `LineLag.advance` along commands (R, T, m), from memory (R, m, 1 + CHAIN), into out.
+
+    keep, up, down (R, T, 1): see `LineLag._keep` and `Flow`, as are turn and usual (m,).
+    """
+    half = np.float32(0.5)
+    runs, steps, chambers = signal.shape
+    for r in range(runs):
+        before = memory[r]
+        for t in range(steps):
+            after = out[r, t]
+            share, filling, emptying = keep[r, t, 0], up[r, t, 0], down[r, t, 0]
+            for m in range(chambers):
+                end = signal[r, t, m]
+                for link in range(1, after.shape[1]):
+                    end = share * before[m, link] + (np.float32(1.0) - share) * end
+                    after[m, link] = end
+                gap = end - before[m, 0]
+                times = filling if gap > 0 else emptying
+                size, stated = abs(gap), turn[m] + usual[m]
+                middle = size * math.exp(-half * times * math.sqrt(stated / (turn[m] + size)))
+                after[m, 0] = end - gap * math.exp(-times * math.sqrt(stated / (turn[m] + middle)))
+            before = after
 
 
 def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:

@@ -15,9 +15,11 @@ share. The load is held between two rows; over one of them the equation, a logis
 exactly.
 """
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from surgisoft.compiled import compiled
 from surgisoft.surrogate.effects.base import (
     ArmFacts,
     Context,
@@ -29,7 +31,7 @@ from surgisoft.surrogate.effects.base import (
 )
 from surgisoft.surrogate.effects.hypothesis import Hypothesis, no_combinations
 from surgisoft.surrogate.effects.wall_fibres import WallFibres, fibres_tried
-from surgisoft.surrogate.scan import follow
+from surgisoft.surrogate.scan import follow, stepped
 
 USUAL = 0.1
 """Stress, as a share of the largest load, at which the time constant is stated."""
@@ -78,10 +80,13 @@ class RateDependence(WallFibres):
         """(B, K) loads that the fibres of an arm at rest at the actuation (B, m) have followed."""
         return self.fibre_loads(signal)
 
+    def _keep(self, dt: Tensor) -> Tensor:
+        """Share of a stress near zero that dt (..., 1) s leave."""
+        return torch.exp(-dt * (-self.log_tau).exp() / (1 + USUAL / self.log_turn.exp()))
+
     def _decayed(self, dt: Tensor, stress: Tensor) -> tuple[Tensor, Tensor]:
         """What dt (..., 1) s leave of a stress (..., K), and its derivative by the stress."""
-        turn = self.log_turn.exp()
-        keep = torch.exp(-dt * (-self.log_tau).exp() / (1 + USUAL / turn))
+        turn, keep = self.log_turn.exp(), self._keep(dt)
         faster = 1 + (1 - keep) * stress.abs() / turn
         return stress * keep / faster, keep / faster.square()
 
@@ -92,8 +97,11 @@ class RateDependence(WallFibres):
 
     def scan(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
         """(R, T, K) loads that the fibres have followed along the actuation (R, T, m)."""
-        dt = context.dt_s.unsqueeze(-1)
-        return follow(lambda s: self._decayed(dt, s), self.fibre_loads(signal), memory, TOLERANCE)
+        dt, loads = context.dt_s.unsqueeze(-1), self.fibre_loads(signal)
+        out = stepped(_flow, (loads, self._keep(dt)), (self.log_turn.exp(),), memory)
+        if out is not None:
+            return out
+        return follow(lambda s: self._decayed(dt, s), loads, memory, TOLERANCE)
 
     def _behind(self, signal: Tensor, memory: Tensor) -> Tensor:
         """(..., m) part of the loads that the fluid holds back, at share 1."""
@@ -118,6 +126,25 @@ class RateDependence(WallFibres):
             Quantity("turn", value_of(self.log_turn.exp()), "", 0.0, 1e4, both),
             Quantity("others_share", value_of(self.others), "", -1.0, 1.0, "a mixture of shares"),
         ]
+
+
+@compiled
+def _flow(loads, keep, turn, memory, out):
+    """Step `RateDependence.advance` along loads (R, T, K), from memory (R, K), into out.
+
+    keep (R, T, 1): see `RateDependence._keep`; turn (1,): thinning stress.
+    """
+    runs, steps, fibres = loads.shape
+    one = np.float32(1.0)
+    for r in range(runs):
+        before = memory[r]
+        for t in range(steps):
+            left, after = keep[r, t, 0], out[r, t]
+            for k in range(fibres):
+                stress = loads[r, t, k] - before[k]
+                faster = one + (one - left) * abs(stress) / turn[0]
+                after[k] = loads[r, t, k] - stress * left / faster
+            before = after
 
 
 def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:

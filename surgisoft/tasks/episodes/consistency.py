@@ -166,6 +166,8 @@ def _contradictions(log: EpisodeLog, rows: int):
         yield from _numbers_by_name(f"rewards of '{agent}'", terms, rows)
     if not _is_table(log.limits) or not all(map(_is_finite, log.limits.values())):
         yield "its limits are no numbers"
+    elif log.limits and "clearance_mm" not in log.limits:
+        yield "its limits lack the one of the clearance"
     for parts, what in ((log.beams, "beam"), (log.cameras, "camera"), (log.views, "view")):
         yield from _not_a_table(f"{what}s", parts)
         for name in parts:

@@ -303,10 +303,18 @@ class ModelArm:
         if self._random_effects is not None:
             stream, factors = self._random_effects.draw(stream, vary.effects_mm)
         state = self._plant.initial_state(count)
-        stood = []
-        for target in (*passed, pressure):
+        stood, follow = [], None
+        if self._learner is None and factors is None:
+            follow = self._compiled_for(gain, *passed)
+        for target in passed:
+            if follow is not None:
+                change = gain * target - state.pressure
+                state = follow.follow(state, state.pressure + change)
+                continue
             state, points = self._advanced(state, gain * target, 1.0, factors)
             stood.append(points)
+        state, points = self._advanced(state, gain * pressure, 1.0, factors)
+        stood.append(points)
         mount = self._moved(turn)
         points = frames.apply(mount, points)
         part = ArmPart(
@@ -330,10 +338,11 @@ class ModelArm:
             return stream, part
         nominal = self.model.initial_state(count)
         learned = None if self._learner is None else self._learner.start(count)
-        for target, at in zip((*passed, pressure), stood, strict=True):
+        for number, target in enumerate((*passed, pressure)):
             nominal, shape = self._advanced(nominal, target, 1.0)
             if self._learner is None or learned is None:
                 continue
+            at = stood[number]
             stream, noise = stream.normal(self.key_points, 3)
             seen = frames.apply(mount, at) + vary.noise_mm / math.sqrt(STOOD) * noise
             off = (seen - frames.apply(self.pose, shape)) @ self.pose[:3, :3]
@@ -524,6 +533,8 @@ class ModelArm:
 
     def _moved(self, normal: Tensor) -> Tensor:
         """(B, 4, 4) mounts displaced by (B, 6) standard normals: three shifts, three rotations."""
+        if self.vary.mount_mm == self.vary.mount_rad == 0.0:
+            return self.pose.repeat(len(normal), 1, 1)
         turn = self.vary.mount_rad * normal[:, 3:]
         rotation = frames.rotation_from_axis_angle(turn, frames.norm(turn))
         return self.pose @ frames.pose_from(rotation, self.vary.mount_mm * normal[:, :3])

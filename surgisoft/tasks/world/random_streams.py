@@ -9,8 +9,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from surgisoft.compiled import compiled
 
 _GAMMA = -0x61C8864680B583EB
 _MIX_1 = -0x40A7B892E31B1A47
@@ -30,9 +33,13 @@ class Stream:
     def uniform(self, low: float, high: float, *shape: int) -> "tuple[Stream, Tensor]":
         """The advanced streams, and (B, *shape) float32 numbers uniform in [low, high)."""
         size = math.prod(shape)
-        place = self.count[:, None] + torch.arange(1, size + 1, device=self.key.device)
-        bits = _mix(self.key[:, None] + _GAMMA * place)
-        share = _shifted(bits, 40).to(torch.float32) * 2.0**-24
+        if self.key.device.type == "cpu" and type(self.key) is Tensor:
+            share = torch.empty(len(self.key), size)
+            _draw(self.key.numpy(), self.count.numpy(), share.numpy())
+        else:
+            place = self.count[:, None] + torch.arange(1, size + 1, device=self.key.device)
+            bits = _mix(self.key[:, None] + _GAMMA * place)
+            share = _shifted(bits, 40).to(torch.float32) * 2.0**-24
         values = low + (high - low) * share.reshape(len(self.key), *shape)
         return Stream(self.key, self.count + size), values
 
@@ -71,3 +78,15 @@ def _mix(z: Tensor) -> Tensor:
 def _shifted(z: Tensor, bits: int) -> Tensor:
     """Shift to the right that fills with zeros."""
     return (z >> bits) & ((1 << (64 - bits)) - 1)
+
+
+@compiled
+def _draw(key, count, share):
+    """Numbers (B, N) in [0, 1) of streams at counts (B,), into share; see `_mix`."""
+    for b in range(len(key)):
+        for n in range(share.shape[1]):
+            z = key[b] + _GAMMA * (count[b] + n + 1)
+            z = (z ^ ((z >> 30) & ((1 << 34) - 1))) * _MIX_1
+            z = (z ^ ((z >> 27) & ((1 << 37) - 1))) * _MIX_2
+            z = z ^ ((z >> 31) & ((1 << 33) - 1))
+            share[b, n] = np.float32((z >> 40) & ((1 << 24) - 1)) * np.float32(2.0**-24)

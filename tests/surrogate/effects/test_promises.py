@@ -58,6 +58,8 @@ def test_stepping_is_scanning(effect, elapsed):
     effect, steps = stir(copy.deepcopy(effect)), 60
     x, seen = signal(effect, 3, steps, 1), context(3, steps)
     memory = effect.rest(x[:, 0])
+    with torch.no_grad():
+        compiled = effect.scan(memory, x, seen)
     scanned = effect.scan(memory, x, seen)
     answers = effect.apply(x, scanned)
     for t in range(steps):
@@ -67,6 +69,7 @@ def test_stepping_is_scanning(effect, elapsed):
         assert torch.equal(stepped, memory)
         assert torch.equal(answer, effect.apply(x[:, t], memory))
         assert torch.allclose(memory, scanned[:, t], rtol=1e-5, atol=2e-4)
+        assert torch.allclose(memory, compiled[:, t], rtol=1e-5, atol=2e-5)
         assert torch.allclose(answer, answers[:, t], rtol=1e-5, atol=2e-4)
 
 

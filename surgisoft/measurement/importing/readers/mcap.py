@@ -16,6 +16,7 @@ import math
 import os
 import struct
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +32,15 @@ TIME = "t_s"
 """Column of the time."""
 NAMED_BY = ("child_frame_id", "rigid_body_name", "marker_name", "name")
 """Fields by which the items of a list are called, in order of preference."""
-RECORD, CHUNK, CHUNK_HEAD = struct.Struct("<BQ"), 6, struct.Struct("<QQQ")
+RECORD, CHUNK, CHUNK_HEAD = struct.Struct("<BQ"), 6, struct.Struct("<QQQII")
 """Begin of a record (kind, length), the kind of a chunk, and the begin of a chunk (first and last
-time, unpacked size): MCAP specification, https://mcap.dev/spec."""
+time, unpacked size, checksum, length of the compression's name): MCAP specification,
+https://mcap.dev/spec."""
+LONGEST_NAME = 16
+"""Most bytes of a compression's name that is looked at; `zstd` and `lz4` are the known ones."""
+FRAME_HEAD = 32
+"""Bytes of a chunk's packed records that hold the header of a Zstandard or LZ4 frame; the longest
+has 19 (RFC 8878; LZ4 frame format 1.6)."""
 MOST_CELLS = 1 << 27
 """Most cells, rows times columns, of a topic: 1 GiB. Messages whose fields have ever other names
 would have as many columns as messages."""
@@ -126,7 +133,9 @@ def _check_chunks(path: Path, file: Any) -> None:
         kind, size = RECORD.unpack(head)
         begin = file.tell()
         if kind == CHUNK and len(about := file.read(CHUNK_HEAD.size)) == CHUNK_HEAD.size:
-            claimed = CHUNK_HEAD.unpack(about)[2]
+            *_, claimed, _, length = CHUNK_HEAD.unpack(about)
+            packed = file.read(length + 8 + FRAME_HEAD) if length <= LONGEST_NAME else b""
+            claimed = max(claimed, _frame_claims(packed[:length], packed[length + 8 :]))
             if claimed > max(MOST_UNPACKED, MOST_PACKED * size):
                 raise InputError(
                     f"{path}: a chunk of {size} bytes claims to unpack to {claimed}; expected an "
@@ -136,6 +145,24 @@ def _check_chunks(path: Path, file: Any) -> None:
             break
         file.seek(begin + size)
     file.seek(0)
+
+
+def _frame_claims(compression: bytes, head: bytes) -> int:
+    """Unpacked size, bytes, that the header of a compressed frame claims; 0 where it states none.
+
+    The library that unpacks the frame takes that much memory, whatever the chunk claims.
+    """
+    with suppress(ImportError, ValueError, RuntimeError):  # a damaged frame does not unpack
+        if compression == b"zstd":
+            import zstandard
+
+            with suppress(zstandard.ZstdError):
+                return zstandard.frame_content_size(head)
+        if compression == b"lz4":
+            import lz4.frame
+
+            return lz4.frame.get_frame_info(head)["content_size"]
+    return 0
 
 
 def _reader(path: Path, file: Any) -> Any:

@@ -1,0 +1,36 @@
+"""Predictions for single rows of a sample, against those of the model for every row."""
+
+import numpy as np
+import pytest
+import torch
+
+from surgisoft.diagnosis.setup.sample import Arrangement, sample_of
+from surgisoft.measurement.histories import history_of
+from surgisoft.surrogate.checkpoint import default_arm
+from surgisoft.surrogate.effects import make_effect
+from tests.diagnosis.setup.recordings import measured
+
+ROWS = 600
+
+
+@pytest.mark.parametrize("effect", [None, "payload"])
+def test_single_rows_are_those_of_the_whole_prediction(effect):
+    """Also behind an effect of the body, whose model is no function of single rows."""
+    model, recording = default_arm(), measured(ROWS)
+    if effect:
+        load = make_effect(effect, model.facts)
+        with torch.no_grad():
+            for amplitude in load.amplitudes().values():
+                amplitude.fill_(0.5)
+        model = model.replace(effects={**model.effects, effect: load})
+    assert model.row_wise is (effect is None)
+    swapped = Arrangement((1, 0, 2), (1.0, 1.0, 1.0))
+    driven = history_of([recording])
+    driven = type(driven)(**{**vars(driven), "pressure": driven.pressure[..., [1, 0, 2]]})
+    with torch.no_grad():
+        truth = model.predict(driven)[0].numpy()
+    rows = np.array([3, 599, 250, 3])
+    found = sample_of(model, [recording], ROWS).along(swapped)
+    assert np.abs(found(rows) - truth[rows]).max() < 1e-4
+    assert np.abs(found.whole - truth).max() < 1e-4
+    assert np.abs(found(rows) - truth[rows]).max() < 1e-4

@@ -1,0 +1,82 @@
+"""A task in another package: the one of docs/tasks.md, installed as its entry point is."""
+
+import importlib
+import json
+import re
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import surgisoft
+from surgisoft.cli import run
+from surgisoft.errors import InputError
+from surgisoft.tasks.registry import TASKS, make_task, spec_of, task_names
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "tasks.md"
+
+
+@pytest.fixture
+def installed(tmp_path, monkeypatch):
+    """The package of the page, with its own line of entry points and others that are wrong."""
+    page = PAGE.read_text()
+    source = re.search(r'```python title="my_tasks/smooth.py"\n(.*?)```', page, re.S)[1]
+    entry = re.search(r"entry-points.\"surgisoft.tasks\"\]\n(.*?)```", page, re.S)[1].replace(
+        '"', ""
+    )
+    (tmp_path / "my_tasks").mkdir()
+    (tmp_path / "my_tasks" / "__init__.py").touch()
+    (tmp_path / "my_tasks" / "smooth.py").write_text(source)
+    info = tmp_path / "my_tasks-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Name: my_tasks\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        f"[surgisoft.tasks]\n{entry}absent = my_tasks.absent:X\n"
+        "function = my_tasks.smooth:smooth_circle\nrenamed = my_tasks.smooth:SMOOTH_CIRCLE\n"
+        "track_circle = my_tasks.smooth:SMOOTH_CIRCLE\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    importlib.invalidate_caches()
+    yield tmp_path
+    for name in ("my_tasks", "my_tasks.smooth"):
+        sys.modules.pop(name, None)
+
+
+def test_its_reward_is_the_packages_and_its_own_term(installed):
+    """Against `track_circle` at the same seed and actions: equal but for the price."""
+    own = surgisoft.batched_env("smooth_circle", num_envs=2, seed=5)
+    plain = surgisoft.batched_env("track_circle", num_envs=2, seed=5)
+    change = torch.tensor([[1.0, -2.0, 0.5]]).repeat(2, 1)
+    before = own.state.world.arms["arm"].seen_kPa
+    now, usual = own.step({"arm": change}), plain.step({"arm": change})
+    moved = own.state.world.arms["arm"].seen_kPa - before  # the pumps follow the command slowly
+    assert torch.equal(now.terms["arm"]["track"], usual.terms["arm"]["track"])
+    price = now.terms["arm"]["smooth"]
+    assert torch.allclose(price, -0.01 * moved.square().sum(1))
+    assert (price < 0.0).all()
+    assert torch.allclose(now.rewards["arm"], usual.rewards["arm"] + price)
+
+
+def test_it_is_trained_and_evaluated_by_its_name(installed, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    options = "--task smooth_circle --steps 512 --envs 32 ppo.evaluation_episodes=2 -o own"
+    assert run(["train", *options.split()]) == 0
+    last = json.loads((tmp_path / "own" / "metrics.jsonl").read_text().splitlines()[-1])
+    assert last["term/arm/smooth"] < 0.0
+    assert run(["evaluate", "own", "--episodes", "1"]) == 0
+    assert "smooth_circle, simulation: 1 episode" in capsys.readouterr().out
+
+
+def test_what_a_package_offers_is_checked(installed):
+    assert task_names()[: len(TASKS)] == list(TASKS)
+    assert {"smooth_circle", "absent", "function", "renamed"} <= set(task_names())
+    assert spec_of("track_circle") is TASKS["track_circle"], "the package's own names stay"
+    with pytest.raises(InputError, match=r"'absent' .*does not load .*remove that package"):
+        make_task("absent")
+    with pytest.raises(InputError, match=r"'function' .*is a function, expected a .*TaskSpec"):
+        make_task("function")
+    with pytest.raises(InputError, match="'renamed': its name is 'smooth_circle'"):
+        make_task("renamed")
+    with pytest.raises(InputError, match=r"unknown task 'smoth_circle'.*smooth_circle"):
+        make_task("smoth_circle")

@@ -9,9 +9,10 @@ The values v of a fit err by H^-1 (e_1 + e_2 + e_3), with H the curvature of the
   network's error would count here and again in e_2;
 - e_2 the network's own error (model discrepancy, Kennedy & O'Hagan 2001), which resembles the
   effect a little. A recording shows one such error, however long it is, so its blocks do not tell
-  by how much it moves the values. Its covariance is that of `network_error`, at the validated size;
-  for a model without a network that of the random function of `discrepancy`, J' W K W J with
-  K = F F' times the covariance along the body;
+  by how much it moves the values. Its covariance is that of `network_error`, at the validated size
+  or, where it is larger, at that of what the fit leaves. For a model without a network it is that
+  of the random function of `discrepancy`, J' W K W J with K = F F' times the covariance along the
+  body;
 - e_3 what holds values near their start where the rows say little: the spread of that prior.
 
 Draws from that covariance go through `Effect.quantities`. With B blocks the first part is widened
@@ -135,19 +136,30 @@ def with_covariance(fit: Fit, problem: Problem, network: NetworkError | None) ->
     centred = slopes - slopes.mean(0)
     wider = stdtrit(blocks - 1, 0.975) / ndtri(0.975)
     meat = centred.T @ centred * wider**2 * blocks / (blocks - 1)
+    larger = _beyond_tolerance(fit, problem)
     if network is not None:
         pulls = network.pulls(weighted)
-        meat += pulls @ pulls.T
+        meat += larger * (pulls @ pulls.T)
     else:
         # (n, 3, F, P) how each feature of the discrepancy pulls at the values.
         pull = np.einsum("sf,sncp->ncfp", fit.nuisance.features, weighted, optimize=True)
         body = body_covariance(problem.discrepancy_mm)
-        meat += np.einsum("kcfp,kl,lcfq->pq", pull, body, pull, optimize=True)
+        meat += larger * np.einsum("kcfp,kl,lcfq->pq", pull, body, pull, optimize=True)
     meat += fit.hold @ (fit.prior_variance[:, None] * fit.hold)
     curvature = weighted.reshape(-1, count).T @ fit.jacobian.reshape(-1, count)
     curvature = (curvature + curvature.T) / 2 + fit.hold
     curvature += 1e-9 * np.diag(curvature).max() * np.eye(count)
     return Fitted(fit, curvature, meat)
+
+
+def _beyond_tolerance(fit: Fit, problem: Problem) -> float:
+    """Mean square that a fit leaves, noise taken off, over that which the right effect may leave.
+
+    At least 1. A network that is off by more than it was validated to be errs by as much in the
+    direction of the effect, too.
+    """
+    left = np.nanmean(np.square(fit.residual).sum(-1)) - np.mean(problem.noise_mm**2)
+    return max(1.0, float(left / np.mean(problem.tolerance_mm**2)))
 
 
 def p_value(fitted: Fitted, amplitudes: np.ndarray) -> float:

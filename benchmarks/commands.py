@@ -337,7 +337,7 @@ def robust(
         ),
     ] = "ring,scripted",
     robots: Annotated[
-        str, typer.Option(help="Seeds of the robots, with commas; 0 to 10 served for development.")
+        str, typer.Option(help="Seeds of the robots, with commas; 0 to 18 served for development.")
     ] = "21,22,23,24,25,26,27,28,29,30",
     own: Annotated[
         str, typer.Option(help="Those that a model is fitted to, too, with commas; may be empty.")
@@ -349,6 +349,9 @@ def robust(
     hidden_episodes: Annotated[
         int, typer.Option(min=1, help="Episodes of each hidden effect and robot.")
     ] = 2,
+    hidden: Annotated[
+        str, typer.Option(help="Hidden effects, with commas; empty: all of them.")
+    ] = "",
     observers: Annotated[
         str, typer.Option(help="Observers, with commas: filter, learns.")
     ] = "filter,learns",
@@ -373,6 +376,7 @@ def robust(
 
     from benchmarks.robust import FILTER, LEARNS, Method, Study, draw, markdown, run
     from surgisoft.errors import unknown_name
+    from surgisoft.rig.hidden import HIDDEN
 
     check_free(json_file, "cases")
     check_folder(work)
@@ -400,6 +404,7 @@ def robust(
         best,
         seeds("--hidden-robots", hidden_robots),
         hidden_episodes,
+        tuple(hidden.split(",")) if hidden else tuple(HIDDEN),
         exact,
     )
     torch.set_num_threads(1)
@@ -410,6 +415,7 @@ def robust(
     command = f"surgisoft benchmark robust --policies {','.join(names.values())}"
     command += f" --robots {robots} --own '{own}' --episodes {episodes}"
     command += f" --hidden-robots '{hidden_robots}' --hidden-episodes {hidden_episodes}"
+    command += f" --hidden {hidden}" if hidden else ""
     command += "" if observers == "filter,learns" else f" --observers {observers}"
     command += "" if exact else " --batched"
     shown = ""

@@ -24,7 +24,7 @@ from surgisoft.agents.evaluate import bootstrap, evaluate
 from surgisoft.agents.on_rig import RigConfig, on_rig
 from surgisoft.agents.policies import open_policy
 from surgisoft.agents.run_folder import RunFolder
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, unknown_name
 from surgisoft.measurement.histories import arm_spec, history_of
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.progress import Progress, noted
@@ -37,7 +37,7 @@ from surgisoft.tasks.registry import config_of, make_task, with_fields
 
 TASK = "circle_ablation"
 """The task that is judged."""
-DEVELOPMENT = range(11)
+DEVELOPMENT = range(19)
 """Seeds of robots on which the observer's constants were chosen, or that earlier results show."""
 MINUTES_POINTS = 12_000
 """Samples of a robot's own recording: ten minutes of `mixed` at 20 Hz."""
@@ -79,6 +79,8 @@ class Study:
     """Robots with hidden effects."""
     hidden_episodes: int
     """Episodes of each hidden effect on each of these robots."""
+    hidden: tuple[str, ...] = tuple(HIDDEN)
+    """Names of the hidden effects."""
     exact: bool = True
     """Whether FCL decides about contact; else the engine of training."""
     seed: int = 2000
@@ -91,6 +93,9 @@ class Study:
                 f"robust: robots {', '.join(map(str, known))} took part in the development; "
                 f"expected seeds from {DEVELOPMENT.stop}"
             )
+        for name in self.hidden:
+            if name not in HIDDEN:
+                raise unknown_name("hidden effect", name, HIDDEN)
         names = [method.name for method in self.methods]
         for name in self.hidden_methods:
             if name not in names:
@@ -138,7 +143,7 @@ def run(study: Study, folder: Path, report: Progress) -> tuple[list[Row], list[F
         (method, DEFAULT, robot, hidden, study.hidden_episodes)
         for method in study.methods
         if method.name in study.hidden_methods
-        for hidden in HIDDEN
+        for hidden in study.hidden
         for robot in study.hidden_robots
     ]
     rows = []
@@ -299,7 +304,7 @@ def _hidden_lines(rows: list[Row], study: Study) -> list[str]:
         error = np.nanmean(_of(some, "beam_error_mm"))
         return f"{sum(_of(some, 'cut'))} of {len(_of(some, 'cut'))}, {error:.2f}"
 
-    for hidden in HIDDEN:
+    for hidden in study.hidden:
         parts = [[r for r in rows if (r.method, r.hidden) == (name, hidden)] for name in names]
         if all(parts):
             lines.append(f"| `{hidden}` | " + " | ".join(cell(part) for part in parts) + " |")

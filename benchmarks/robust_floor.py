@@ -19,6 +19,7 @@ from surgisoft.agents.observer import ObserverGains
 from surgisoft.agents.policies import Scripted
 from surgisoft.agents.rollout import Instant, rollout
 from surgisoft.rig import VirtualRig
+from surgisoft.surrogate.reach import steady_key_points
 from surgisoft.tasks.inverse_kinematics import Pointing
 from surgisoft.tasks.registry import make_task
 from surgisoft.tasks.world.adaptation import DisturbanceEstimator
@@ -87,8 +88,10 @@ def floor(robot: int) -> Floor:
     after = round(APPROACH_S / 0.1)
     true, goal = torch.tensor(points)[after:], torch.tensor(targets)[after:]
     learned, memory = [], estimator.start(1)
-    for each, pressure in zip(off, kPa, strict=True):
-        memory, now = estimator.updated(memory, each, pressure)
+    rest = steady_key_points(arm.model, kPa[:, 0].double().numpy())
+    bodies = torch.tensor(rest, dtype=torch.float32)[:, None]
+    for each, pressure, body in zip(off, kPa, bodies, strict=True):
+        memory, now, _ = estimator.updated(memory, each, pressure, body)
         learned.append(now[0])
     raw = torch.nan_to_num(off[first:, 0])
     return Floor(

@@ -96,6 +96,7 @@ class MeasuredArm:
             offset_mm=zero,
             plant=plant,
             belief=None,
+            lead_mm=self.observer.no_lead(zero),
             factors=None,
         )
         points = self.observer.followed(part, pressure, 0.0).points_mm

@@ -89,6 +89,10 @@ class Observer:
         """What is known of the disturbance of `count` arms before the first measurement."""
         return None if self.learner is None else self.learner.start(count)
 
+    def no_lead(self, points_mm: Tensor) -> Tensor | None:
+        """`ArmPart.lead_mm` of arms with key points (B, n, 3) mm before the first measurement."""
+        return None if self.learner is None else torch.zeros_like(points_mm)
+
     def followed(self, part: ArmPart, pressure: Tensor, dt_s: Tensor | float) -> ArmPart:
         """The model after pressures (B, m) kPa were measured dt_s after the sample before."""
         model, points = self.arm.bent(part, pressure, dt_s)
@@ -167,7 +171,8 @@ class Observer:
         assert self.learner is not None
         turn = part.mount[:, :3, :3]
         off = (measured - part.points_mm) @ turn
-        memory, now = self.learner.updated(part.plant.adaptation, off, pressure)
+        body = (part.points_mm - part.mount[:, None, :3, 3]) @ turn
+        memory, now, lead = self.learner.updated(part.plant.adaptation, off, pressure, body)
         offset = self.learner.expected(memory, pressure) @ turn.mT
         plant = replace(part.plant, adaptation=memory)
-        return now @ turn.mT, replace(part, plant=plant, offset_mm=offset)
+        return now @ turn.mT, replace(part, plant=plant, offset_mm=offset, lead_mm=lead @ turn.mT)

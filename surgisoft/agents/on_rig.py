@@ -255,6 +255,7 @@ class RigArm:
             gain=torch.ones_like(part.gain),
             arm=self.model.initial_state(len(rigs.items)),
             belief=None,
+            lead_mm=self.observer.no_lead(part.points_mm),
             factors=None,
             plant=RigPlant(
                 rigs,

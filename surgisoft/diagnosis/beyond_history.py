@@ -10,6 +10,12 @@ look for that in what a black box with memory leaves, without asking what it is:
   change with unknown change point"; with a known moment: Chow 1960), and held-out blocks judge;
 - a *line*: one frequency that holds much of what is left, and neither of the actuation nor of the
   predicted motion (Fisher 1929, "Tests of significance in harmonic analysis").
+
+A third test has a form of its own, because two effects of the list resemble it: a *sudden turn*, a
+rigid turn and shift of the whole body that sets in at one moment. A frame that is turned from the
+beginning (misalignment) and a holder that yields gradually (drift) imitate it, and a black box that
+knows the time learns it. In the terms of fault diagnosis it is an abrupt fault beside an incipient
+one (Isermann 2006, "Fault-Diagnosis Systems", sec. 2.2).
 """
 
 from collections.abc import Sequence
@@ -18,6 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from surgisoft.diagnosis.cross_validation import CrossValidation, Split
 from surgisoft.diagnosis.residuals import Problem
 from surgisoft.diagnosis.statistics import block_sums
 
@@ -80,6 +87,34 @@ def beyond_history(problem: Problem, features: np.ndarray) -> BeyondHistory:
         break_at=float(places[place]),
         line=strongest_line(problem, remainder),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class SuddenTurn:
+    """A rigid turn and shift of the whole body that sets in at one moment."""
+
+    losses: np.ndarray
+    """(B,) held-out sum of squared distances by block with the best one, mm^2."""
+    at: float
+    """Its place, as a share of the rows, 0 to 1."""
+
+
+def sudden_turn(split: Split, points: np.ndarray) -> SuddenTurn:
+    """The best sudden turn on the rows of a split, the model discrepancy beside it.
+
+    points: (S, n, 3) predicted key points, mm. To first order each point p moves by w x p + d from
+    the moment on. Held-out blocks choose the moment.
+    """
+    axes = np.eye(3)
+    turned = np.cross(axes, points[:, :, None, :])  # (S, n, 3 axes, 3)
+    rigid = np.concatenate([turned, np.broadcast_to(axes, turned.shape)], axis=2).swapaxes(2, 3)
+    places = np.linspace(MARGIN, 1.0 - MARGIN, BREAKS)
+    behind = [np.arange(len(points)) >= int(place * len(points)) for place in places]
+    parts = [rigid * each[:, None, None, None] for each in behind]
+    validation, size = CrossValidation.on(split, np.concatenate(parts, axis=3)), rigid.shape[3]
+    losses = [validation.losses(range(n * size, (n + 1) * size)) for n in range(BREAKS)]
+    best = int(np.argmin([each.sum() for each in losses]))
+    return SuddenTurn(losses[best], float(places[best]))
 
 
 class _Folds:

@@ -52,9 +52,9 @@ Reason = Literal["network", "learned", "few_data", "schedule"]
 """Why a diagnosis cannot tell: the model is not that of this arm; the model has learned part of
 what is missing; there are too few motions; the schedule does not tell effects apart."""
 
-SCHEMA = 3
-"""Version of the asset's format and of the features. Assets of earlier schemas still open: features
-that are newer have no weight, and one of schema 1 has no calibration."""
+SCHEMA = 4
+"""Version of the asset's format and of the features: weights belong to the features that they were
+fitted with, so an asset of another version is fitted again."""
 ASSET = Path(__file__).parents[1] / "assets" / "decision" / "decision.json"
 """The fitted decision that is in force."""
 FEW_MOTIONS = 24
@@ -95,8 +95,6 @@ class Feature:
     """Computes it from the evidence; for `first` from an effect's evidence and all of it."""
     meaning: str
     """What it is."""
-    since: int = 1
-    """Schema of the asset that had it first."""
 
 
 def _between(value: float, low: float, high: float) -> float:
@@ -134,12 +132,6 @@ def _left_size(evidence: Evidence) -> float:
     """Error above the floor that the best proposal leaves, in units of the discrepancy."""
     some = [each.left_size for each in evidence.proposals]
     return min([evidence.size_beside_discrepancy, *some])
-
-
-def _box_better(evidence: Evidence) -> float:
-    """Log gain of the black box over the best proposal."""
-    some = [each.left_log_box for each in evidence.proposals]
-    return _between(min([evidence.box_log_gain, *some]), -1.0, 1.0)
 
 
 def _free_better(evidence: Evidence) -> float:
@@ -186,8 +178,25 @@ def _stays(evidence: Evidence) -> float:
 
 
 def _most_lack_of_fit(evidence: Evidence) -> float:
+    """Log of the largest lack of fit of a proposal over what a formula gets wrong, over 3.
+
+    On a log scale, because a formula that is right leaves its relaxed form next to nothing to
+    explain: a lack of fit of 0.2 is ten times what it may be, and not a fifth of the worst.
+    """
     some = [lack_of_fit(each.form_gain, each.form_log_gain) for each in evidence.proposals]
-    return max(some, default=0.0)
+    return math.log1p(max(some, default=0.0) / FORM_SHARE) / 3.0
+
+
+def _definition_z(evidence: Evidence) -> float:
+    """Quantile of the relaxed form of the best single proposal that is its formula by definition.
+
+    0 for others.
+    """
+    if not evidence.proposals:
+        return 0.0
+    one = evidence.proposals[0]
+    defined = {each.effect for each in evidence.effects if each.by_definition}
+    return _z(one.form_z) if one.effects[0] in defined else 0.0
 
 
 def _exact_left(evidence: Evidence) -> float:
@@ -275,9 +284,14 @@ def _margin(effect: EffectEvidence, evidence: Evidence) -> float:
 
 
 def _proposed(effect: EffectEvidence, evidence: Evidence) -> float:
-    """What the second of two effects explains, for either of them; 0 for others."""
+    """What the second of two effects explains as far as it is beyond chance, for either of them.
+
+    0 for others. Where few motions show the two, the second is found by chance, and the two would
+    stand above the effects that do as well in the place of one of them.
+    """
     own = any(effect.effect in each.effects for each in evidence.proposals[1:])
-    return own * _between(_last(evidence, "own_gain"), 0.0, 1.0) * _beyond_form(evidence)
+    gain = _between(_last(evidence, "own_gain"), 0.0, 1.0) * _z(_last(evidence, "own_z"))
+    return own * gain * _beyond_form(evidence)
 
 
 def _single_lack_of_fit(evidence: Evidence) -> float:
@@ -331,42 +345,36 @@ MISSING = (
         +1,
         lambda e: _log(e.error_over_validated, -1.0, 2.0),
         "log of the error over the validated error",
-        since=2,
     ),
     Feature(
         "size",
         +1,
         lambda e: _log(e.size, -1.0, 2.0),
         "log of the error above the floor over the validated one",
-        since=2,
     ),
     Feature(
         "of_box",
         +1,
         _of_box,
         "what the best proposal explains, as a share of what a black box with memory explains",
-        since=2,
     ),
     Feature(
         "stays",
         -1,
         _stays,
         "log of the share of the error above the floor that the best proposal leaves",
-        since=2,
     ),
     Feature(
         "break",
         +1,
         _break,
         "log gain of one break in time over a black box with memory, or over the best proposal",
-        since=3,
     ),
     Feature(
         "line",
         +1,
         _line,
         "share of what a black box with memory leaves in one line of its spectrum",
-        since=3,
     ),
 )
 BEYOND_HISTORY = (
@@ -375,14 +383,12 @@ BEYOND_HISTORY = (
         -1,
         _break,
         "log gain of one break in time over a black box with memory, or over the best proposal",
-        since=3,
     ),
     Feature(
         "line",
         -1,
         _line,
         "share of what a black box with memory leaves in one line of its spectrum",
-        since=3,
     ),
 )
 """Features of two models: signs of what no function of the actuation and its past explains."""
@@ -399,12 +405,25 @@ KNOWN = (
         lambda e: _log(_left_size(e), -1.0, 2.0),
         "log of the error that the best proposal leaves, over the validated error",
     ),
-    Feature("box_better", -1, _box_better, "log gain of the black box over the best proposal"),
     Feature(
         "lack_of_fit",
         -1,
         _most_lack_of_fit,
-        "what relaxed forms of a proposal explain besides (root of gain x log gain)",
+        "log of what relaxed forms of a proposal explain besides (root of gain x log gain), over "
+        "what a formula gets wrong",
+    ),
+    Feature(
+        "form_z",
+        -1,
+        lambda e: _z(_most(e, "form_z", 0.0)),
+        "normal quantile of the p-value of a proposal's relaxed form",
+    ),
+    Feature(
+        "definition_z",
+        -1,
+        _definition_z,
+        "p-value (normal quantile) of the best single proposal's relaxed form, if that makes it "
+        "another effect by definition (gain, frame)",
     ),
     Feature(
         "exact_left",
@@ -419,6 +438,12 @@ KNOWN = (
         "normal quantile of the best effect's family-wise p-value",
     ),
     *BEYOND_HISTORY,
+    Feature(
+        "sudden",
+        -1,
+        lambda e: _z(e.sudden_margin),
+        "studentised log gain of a sudden turn over the best proposal, where that moves the base",
+    ),
 )
 FIRST = (
     Feature(
@@ -635,7 +660,7 @@ def load_decision(path: Path = ASSET) -> DecisionModel:
     except (OSError, InputError) as reason:
         raise InputError(f"{path.name}: no fitted decision ({reason}); install again") from None
     found = values.get("schema") if isinstance(values, dict) else None
-    if type(found) is not int or not 1 <= found <= SCHEMA:
+    if type(found) is not int or found != SCHEMA:
         raise InputError(
             f"{path.name}: a fitted decision of schema {found}, expected {SCHEMA}; fit it again"
         )
@@ -645,7 +670,7 @@ def load_decision(path: Path = ASSET) -> DecisionModel:
     for name, features in FEATURES.items():
         one = _table(_table(values.get("models")).get(name))
         weights = _table(one.get("weights"))
-        expected = [feature.name for feature in features if feature.since <= found]
+        expected = [feature.name for feature in features]
         if list(weights) != expected:
             raise InputError(
                 f"{path.name}: model '{name}' has the features {', '.join(weights)},"
@@ -656,8 +681,7 @@ def load_decision(path: Path = ASSET) -> DecisionModel:
             raise InputError(
                 f"{path.name}: model '{name}' has a weight that is no finite number; fit it again"
             )
-        each = tuple(float(weights.get(feature.name, 0.0)) for feature in features)
-        models[name] = Logistic(each, numbers[-1])
+        models[name] = Logistic(tuple(map(float, weights.values())), numbers[-1])
     curves = values.get("calibration", {})
     if not isinstance(curves, dict):
         raise InputError(f"{path.name}: calibration is no table; fit it again")

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
-from surgisoft.diagnosis.beyond_history import beyond_history
-from surgisoft.diagnosis.selection import Findings, ModelSelection, Score
+from surgisoft.diagnosis.beyond_history import beyond_history, sudden_turn
+from surgisoft.diagnosis.selection import Findings, ModelSelection, Score, Selected
 from surgisoft.diagnosis.statistics import block_sums, studentised
 from surgisoft.surrogate.effects import hypothesis_of, known_effects
 
-VERSION = 2
+VERSION = 3
 """Version of the evidence, raised when a number gets another meaning: stored evidence of another
 version is collected again."""
 COLLINEAR_RIDGE = 1e-6
@@ -55,6 +55,8 @@ class EffectEvidence:
     """Log gain of its relaxed form."""
     form_z: float | None = None
     """Normal quantile of the p-value of its relaxed form."""
+    by_definition: bool = False
+    """Whether the effect is its formula by definition (a constant factor, a rotated frame)."""
     free_amplitudes: int | None = None
     """Number of amplitudes that its fit chose, those of a refined candidate too; None in stored
     evidence that does not have it."""
@@ -156,6 +158,11 @@ class Evidence:
     line: float = 0.0
     """Share of what the free black box leaves above the noise in one line of its spectrum that is
     none of the actuation or the predicted motion."""
+    sudden_log_gain: float = 0.0
+    """Log gain of a sudden turn of the whole body (`beyond_history`) over the best single proposal,
+    where that is an effect that moves the base; 0 elsewhere."""
+    sudden_margin: float = 0.0
+    """Studentised mean over motions of that log gain."""
 
     def to_json(self) -> dict:
         """Plain values."""
@@ -194,6 +201,7 @@ def evidence_of(found: Findings) -> Evidence:
     above = selection.explainable(raw, [free])
     beside = selection.explainable(null, [box.losses, *(s.losses for s in found.first)])
     beyond = beyond_history(problem, box.features)
+    sudden = sudden_log_gain(found)
     stated = problem.discrepancy_mm**2 + problem.noise_mm**2
     validated = float((seen.sum(0) * stated).sum())
     return Evidence(
@@ -216,11 +224,34 @@ def evidence_of(found: Findings) -> Evidence:
         free_log_gain=float(selection.log_ratio(null, free).mean()),
         break_log_gain=float(selection.log_ratio(beyond.losses, beyond.break_losses).mean()),
         line=beyond.line,
+        sudden_log_gain=float(sudden.mean()),
+        sudden_margin=_margin(found, sudden),
     )
+
+
+def sudden_log_gain(found: Selected) -> np.ndarray:
+    """(B,) log gain of a sudden turn of the whole body over the best single proposal.
+
+    0 where that is no effect that moves the base. Neither contains the other, so its studentised
+    mean decides between the two (Vuong 1989, "Likelihood ratio tests for model selection and
+    non-nested hypotheses").
+    """
+    selection, best = found.selection, found.proposals[:1]
+    known = known_effects()
+    if not any(hypothesis_of(known[name]).moves_base for one in best for name in one.effects):
+        return np.zeros(len(selection.floor))
+    sudden = sudden_turn(selection.validation.split, selection.problem.predicted)
+    return selection.log_ratio(selection.losses(best[0].chosen), sudden.losses)
 
 
 def _share(part: float, whole: float) -> float:
     return float(min(max(part / whole, 0.0), 1.0))
+
+
+def _margin(found: Selected, gap: np.ndarray) -> float:
+    """Studentised mean over motions of differences (B,) by block; 0 where there are none."""
+    by_motion = found.problem.by_motion(gap[None])
+    return float(studentised(by_motion)[0]) if by_motion.any() else 0.0
 
 
 def _effect(found: Findings, best: Score, score: Score) -> EffectEvidence:
@@ -228,9 +259,9 @@ def _effect(found: Findings, best: Score, score: Score) -> EffectEvidence:
     selection, floor = found.selection, float(found.selection.floor.sum())
     margin = 0.0
     form = found.forms.get(score.effect)
+    hypothesis = hypothesis_of(known_effects()[score.effect])
     if score is not best:
-        gap = found.problem.by_motion((best.log_gain - score.log_gain)[None])
-        margin = float(studentised(gap)[0]) if gap.any() else 0.0
+        margin = _margin(found, best.log_gain - score.log_gain)
     return EffectEvidence(
         effect=score.effect,
         gain=float(score.gain),
@@ -242,7 +273,8 @@ def _effect(found: Findings, best: Score, score: Score) -> EffectEvidence:
         collinear=1.0 if score is best else collinearity(selection, best, score),
         amplitudes=len(score.option.chosen),
         free_amplitudes=score.option.amplitudes,
-        exact_form=hypothesis_of(known_effects()[score.effect]).exact_form,
+        exact_form=hypothesis.exact_form,
+        by_definition=hypothesis.by_definition,
         form_gain=None if form is None else form.share,
         form_log_gain=None if form is None else form.log_gain,
         form_z=None if form is None else normal_quantile(form.p_value),
@@ -281,7 +313,7 @@ def _proposal(found: Findings, place: int, free: np.ndarray) -> ProposalEvidence
     first = max(alone.get(proposal.effects[0], 0.0), 1e-3)
     own = proposal.beside
     others = [score for score in proposal.instead if score is not None]
-    gaps = [found.problem.by_motion(selection.log_ratio(s.losses, after)[None]) for s in others]
+    gaps = [selection.log_ratio(score.losses, after) for score in others]
     return ProposalEvidence(
         effects=proposal.effects,
         gain=_share(null.sum() - after.sum(), selection.explainable(null, tried)),
@@ -302,6 +334,6 @@ def _proposal(found: Findings, place: int, free: np.ndarray) -> ProposalEvidence
         instead_left=tuple(
             math.log((score.losses.sum() + floor) / (after.sum() + floor)) for score in others
         ),
-        instead_margin=tuple(float(studentised(gap)[0]) if gap.any() else 0.0 for gap in gaps),
+        instead_margin=tuple(_margin(found, gap) for gap in gaps),
         left_log_free=float(selection.log_ratio(after, free).mean()),
     )

@@ -180,7 +180,7 @@ class Keyhole:
     def blocks(self, state: TaskState[WaypointSequence]) -> dict[str, ObservationBlocks]:
         """Observation blocks: body, target, next stride, clearance, visits and time."""
         part, route = state.world.arms["arm"], self.route_mm(state)
-        tip = part.seen_mm[:, -1]
+        tip = part.steered_mm[:, -1]
         onward = point_at(route, progress(route, tip).along_mm + self._stride_mm)
         return {
             "arm": {

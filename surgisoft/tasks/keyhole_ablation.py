@@ -227,7 +227,7 @@ class KeyholeAblation(RingTask[PortCut]):
             agent: {
                 **blocks,
                 RIM: rims[agent][:, None].clamp(-40.0, 20.0) / 10.0,
-                CENTRED: self.off_axis_mm(agent, arms[agent].seen_mm).asinh(),
+                CENTRED: self.off_axis_mm(agent, arms[agent].steered_mm).asinh(),
             }
             for agent, blocks in super().blocks(state).items()
         }

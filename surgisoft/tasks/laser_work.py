@@ -457,8 +457,8 @@ class OneLaserTask(LaserTask[Progress]):
         arms, point = state.world.arms, self.pointing
         laser, eye = arms[LASER], arms[ENDOSCOPE]
         ahead = [self.target_mm(state, k) for k in range(self.config.preview + 1)]
-        offsets = [point[LASER].offset_mm(laser.seen_mm, target) for target in ahead]
-        look = point[ENDOSCOPE].offset_mm(eye.seen_mm, self.watched_mm(state))
+        offsets = [point[LASER].offset_mm(laser.steered_mm, target) for target in ahead]
+        look = point[ENDOSCOPE].offset_mm(eye.steered_mm, self.watched_mm(state))
         own: dict[str, ObservationBlocks] = {
             LASER: {
                 **numbered(BEAM_ERROR, [offset.asinh() for offset in offsets]),

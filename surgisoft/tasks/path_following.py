@@ -16,6 +16,7 @@ from surgisoft.tasks.inverse_kinematics import action_towards
 from surgisoft.tasks.observations import (
     Block,
     ObservationBlocks,
+    asinh,
     joined,
     numbered,
     pressure_blocks,
@@ -225,16 +226,16 @@ class Follow:
         two and the predicted one are also scaled with `fine_mm`.
         """
         part, history = state.world.arms["arm"], state.goal.history
-        point = self.marker(part.seen_mm)
+        point = self.marker(part.steered_mm)
         errors = [self.target_mm(state, ahead) - point for ahead in range(self.config.preview + 1)]
         blocks = {
-            SHAPE: (part.seen_mm - self._rest)[:, 1:].flatten(1) / 10.0,
-            **numbered(ERROR, [error.asinh() for error in errors]),
-            **numbered(FINE, [(error / self.config.fine_mm).asinh() for error in errors[:2]]),
+            SHAPE: (part.steered_mm - self._rest)[:, 1:].flatten(1) / 10.0,
+            **numbered(ERROR, [asinh(error) for error in errors]),
+            **numbered(FINE, [asinh(error / self.config.fine_mm) for error in errors[:2]]),
         }
         if self.config.one_step_prediction:
             predicted = self.target_mm(state, 1) - self.marker(self._held(part))
-            blocks[PREDICTED] = (predicted / self.config.fine_mm).asinh()
+            blocks[PREDICTED] = asinh(predicted / self.config.fine_mm)
         blocks |= pressure_blocks(self.arm, part)
         blocks[PRESSURE_HISTORY] = history.kPa.flatten(1)
         blocks[POINT_HISTORY] = history.mm.flatten(1)
@@ -253,7 +254,7 @@ class Follow:
             return held
         # The model starts from the arm's true shape. Adding only the predicted movement to the
         # measured shape keeps the sensors' noise in the observation.
-        return part.seen_mm + held - self.arm.predict(part, part.pressure, self.dt_s)
+        return part.steered_mm + held - self.arm.predict(part, part.pressure, self.dt_s)
 
     def rewards(self, state: TaskState[FollowGoal]) -> dict[str, dict[str, Tensor]]:
         """Weighted reward terms, see `FollowWeights`."""

@@ -138,10 +138,10 @@ class TrackBody:
         """Observation blocks: body, errors of all key points now and ahead, and time."""
         part = state.world.arms["arm"]
         ahead = [self.target_mm(state, k) for k in range(self.config.preview + 1)]
-        errors = [(target - part.seen_mm)[:, 1:].flatten(1).asinh() for target in ahead]
+        errors = [(target - part.steered_mm)[:, 1:].flatten(1).asinh() for target in ahead]
         return {
             "arm": {
-                SHAPE: (part.seen_mm - self._rest)[:, 1:].flatten(1) / 10.0,
+                SHAPE: (part.steered_mm - self._rest)[:, 1:].flatten(1) / 10.0,
                 **numbered(ERROR, errors),
                 **pressure_blocks(self.arm, part),
                 TIME: 2.0 * state.world.steps[:, None] / self.steps - 1.0,

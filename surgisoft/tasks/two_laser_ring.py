@@ -319,7 +319,7 @@ class TwoLaserRing(LaserTask[SharedCut]):
         seen, fired = self.spots_seen(state).float(), cut.fired.float()
         own: dict[str, ObservationBlocks] = {}
         for k, name in enumerate(LASERS):
-            at = arms[name].seen_mm
+            at = arms[name].steered_mm
             offsets = [point[name].offset_mm(at, targets[k]) for targets in ahead]
             angle = 2.0 * math.pi * cut.share(k, self.round)[:, None]
             own[name] = {
@@ -331,7 +331,7 @@ class TwoLaserRing(LaserTask[SharedCut]):
                 SPOTS: seen.roll(-k, 1),
                 FIRED: fired.roll(-k, 1),
             }
-        look = point[ENDOSCOPE].offset_mm(arms[ENDOSCOPE].seen_mm, self.centre_mm(state))
+        look = point[ENDOSCOPE].offset_mm(arms[ENDOSCOPE].steered_mm, self.centre_mm(state))
         own[ENDOSCOPE] = {VIEW_ERROR: look.asinh(), SPOTS: seen, FIRED: fired}
         return {
             name: {

@@ -1,6 +1,9 @@
 """The control study: runs that are there are taken, and the tables say what was measured."""
 
+import json
 import shutil
+import subprocess
+import sys
 
 import pytest
 
@@ -10,6 +13,7 @@ from benchmarks.control.policies import Cost, cost, evaluated, plan_of, trained
 from benchmarks.control.study import ControlConfig, Evaluated, Results, Trained, run
 from benchmarks.control.table import markdown
 from benchmarks.control.two_processes import trained_by_two
+from surgisoft.cli import run as surgisoft
 from surgisoft.errors import InputError
 
 TINY = ControlConfig(("track_circle",), (4,), 2, 1, rate_steps=0, whole_steps=0)
@@ -103,14 +107,36 @@ def test_goals_are_bold_where_they_are_reached_and_only_there():
 
 
 def test_two_processes_train_together_and_are_taken_once_they_are_done(tmp_path, monkeypatch):
-    place = tmp_path / "whole"
-    told = []
+    """In torchrun's place (tests/agents/test_train_command.py) one process trains, as its word
+    is the same command; what it leaves says two."""
+    place, told = tmp_path / "whole", []
+
+    class Torchrun:
+        def __init__(self, command, stdout, stderr):
+            assert command[:3] == [sys.executable, "-m", "torch.distributed.run"]
+            assert command[3:8] == ["--nproc-per-node", "2", "-m", "surgisoft", "train"]
+            self.returncode = surgisoft(command[7:])
+            about = json.loads((place / "config.json").read_text())
+            (place / "config.json").write_text(json.dumps(about | {"processes": 2}))
+            self.looks = 2
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *error):
+            pass
+
+        def wait(self, seconds):
+            self.looks, self.returncode = self.looks - 1, None if self.looks else 0
+            if self.looks >= 0 and self.returncode is None:
+                raise subprocess.TimeoutExpired("torchrun", seconds)
+
     monkeypatch.setattr(two_processes, "ENVS", 64)
+    monkeypatch.setattr(two_processes.subprocess, "Popen", Torchrun)
     run_folder = trained_by_two(place, "track_circle", 2_000, lambda *seen: told.append(seen))
     assert run_folder.config["processes"] == 2
-    assert all(of == 2_000 for _, of, _ in told)
-    assert told
-    assert cost(run_folder).steps == 2 * 2 * 64 * 12  # two turns of two processes
+    assert [seen[:2] for seen in told] == [(2304, 2_000)] * 2  # three turns of 64 times 12
+    assert cost(run_folder).steps == 2304
     monkeypatch.setattr(two_processes.subprocess, "Popen", lambda *a, **k: pytest.fail("again"))
     assert trained_by_two(place, "track_circle", 2_000, nothing).path == place
     with pytest.raises(InputError, match="track_circle by 2 processes, expected track_square by 2"):

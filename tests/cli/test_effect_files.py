@@ -1,5 +1,6 @@
 """A model that holds a user-defined effect opens in every command, and only with its file named."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -147,6 +148,19 @@ def test_a_command_opens_the_model_only_with_its_file(name, capsys):
     ]
     assert len(following) == NEXT.get(name, len(following))
     assert all(line.endswith(" --effect-file slack.py") for line in following), following
+    if name == "experiment run":
+        same_rows_in_one_process()
+
+
+def same_rows_in_one_process():
+    """The two processes of `experiment run`, which need the file too, gave the rows of one."""
+    both = sorted(Path("results", "rows").iterdir())
+    assert len(both) == 2, "two episodes, each one a block of work"
+    alone = "experiment run short.toml --no-replays -o alone --force --effect-file slack.py"
+    assert run(alone.split()) == 0
+    rows = [json.loads(path.read_text()) for path in both]
+    assert rows == [json.loads(Path("alone", "rows", path.name).read_text()) for path in both]
+    assert rows[0] != rows[1]
 
 
 def test_amend_takes_the_file_as_the_effect_that_the_model_has(capsys):

@@ -1,11 +1,19 @@
 """Breaks and lines in what a black box leaves, against plain regressions and known amplitudes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from surgisoft.diagnosis.beyond_history import BREAK_RIDGE, RIDGES, beyond_history
+from surgisoft.diagnosis.beyond_history import BREAK_RIDGE, RIDGES, beyond_history, sudden_turn
+from surgisoft.diagnosis.candidates import candidates
+from surgisoft.diagnosis.cross_validation import split_of
+from surgisoft.diagnosis.evidence import sudden_log_gain
 from surgisoft.diagnosis.residuals import problem_of
-from tests.diagnosis.synthetic import PERIOD_S, recording, still_model, walk
+from surgisoft.diagnosis.selection import select
+from surgisoft.diagnosis.statistics import studentised
+from surgisoft.surrogate.model import Validation
+from tests.diagnosis.synthetic import NOISE_MM, PERIOD_S, recording, still_model, walk
 
 ROWS = 1200
 
@@ -70,3 +78,64 @@ def test_a_breath_is_a_line_and_a_periodic_actuation_is_none():
     )
     assert beyond_history(driven, driven.pressure).line < 0.2
     assert beyond_history(*posed(np.zeros(ROWS))).line < 0.2
+
+
+def turned_body(angle):
+    """The problem of an arm whose whole body is turned about y by an angle (ROWS,) in rad."""
+    made = recording(np.zeros(ROWS), walk(ROWS))
+    x, y, z = np.moveaxis(made.key_points_mm, -1, 0)
+    c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    turned = np.stack([c * x + s * z, y, c * z - s * x], axis=-1)
+    model = still_model()
+    model.validation = Validation(1e-3, (1e-3,) * 3, ROWS)  # nothing is left to the discrepancy
+    return problem_of(model, [replace(made, key_points_mm=turned)])
+
+
+def noise_of(problem):
+    """Squared noise of all key points and rows, mm^2."""
+    return 3 * 3 * NOISE_MM**2 * len(problem.predicted)
+
+
+def test_a_sudden_turn_is_found_at_its_moment_and_leaves_the_noise():
+    """0.02 rad at three fifths: it moves key points at 5, 30 and 70 mm by 0.1, 0.6 and 1.4 mm."""
+    problem = turned_body(0.02 * (np.arange(ROWS) >= 0.6 * ROWS))
+    found = sudden_turn(split_of(problem), problem.predicted)
+    assert found.at == pytest.approx(0.6, abs=1e-6)
+    assert found.losses.sum() == pytest.approx(noise_of(problem), rel=0.1)
+    assert np.square(problem.residual).sum() > 5 * found.losses.sum()
+
+
+def test_what_grows_is_no_sudden_turn():
+    """The best step for a line leaves 1/3 - (1 - m) (1 + m)^2 / 4 of 1/3: a ninth, at m = 1/3."""
+    problem = turned_body(0.1 * np.arange(ROWS) / ROWS)
+    found = sudden_turn(split_of(problem), problem.predicted)
+    left = found.losses.sum() - noise_of(problem)
+    assert left / (np.square(problem.residual).sum() - noise_of(problem)) > 0.9 / 9
+    assert found.at == pytest.approx(1 / 3, abs=0.06)
+
+
+def test_what_is_there_from_the_beginning_is_no_sudden_turn():
+    """The first moment that is tried leaves the rows before it, a twenty-fifth of the change."""
+    problem = turned_body(np.full(ROWS, 0.1))
+    found = sudden_turn(split_of(problem), problem.predicted)
+    left = found.losses.sum() - noise_of(problem)
+    assert left / (np.square(problem.residual).sum() - noise_of(problem)) > 0.9 / 25
+    assert found.at == pytest.approx(0.04, abs=1e-6)
+
+
+def test_a_knock_is_better_explained_by_a_turn_at_one_moment_and_a_drift_is_not():
+    """Beside misalignment and drift, which both imitate it."""
+    time, margins = np.arange(ROWS) / ROWS, []
+    for shape in (time > 0.4, 1.0 - np.exp(-4.0 * time)):
+        problem = turned_body(0.05 * shape)
+        found = select(problem, candidates(problem, ["misalignment", "drift"]), lambda text: None)
+        margins.append(studentised(problem.by_motion(sudden_log_gain(found)[None]))[0])
+    assert margins[0] > 3.0
+    assert margins[1] < -3.0
+
+
+def test_an_effect_of_the_actuation_is_compared_with_no_sudden_turn():
+    pressure = walk(ROWS)
+    problem = problem_of(still_model(), [recording(0.1 * pressure[:, 0], pressure)])
+    found = select(problem, candidates(problem, ["payload"]), lambda text: None)
+    assert not sudden_log_gain(found).any()

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from surgisoft.diagnosis.criteria import CLAIM, Worth
 from surgisoft.diagnosis.decision import (
     ASSET,
-    CHOSEN_COSTS,
     FEATURES,
+    FORM_SHARE,
+    SCHEMA,
     Curve,
     DecisionModel,
     Logistic,
@@ -332,6 +333,50 @@ def test_where_an_effect_explains_them_there_is_no_break_and_no_line(free, broke
     assert row["line"] == pytest.approx(line)
 
 
+@pytest.mark.parametrize(("gain", "log_gain"), [(0.0, 0.5), (0.04, 0.25), (1.0, 9.0)])
+def test_a_lack_of_fit_counts_by_how_often_it_is_what_a_formula_gets_wrong(gain, log_gain):
+    """The largest of the proposals, log(1 + lack / 0.02) / 3; its significance counts besides."""
+    names = [feature.name for feature in FEATURES["known"]]
+    lacking = replace(ALONE, form_gain=gain, form_log_gain=log_gain, form_z=1.5)
+    evidence = replace(GOOD, proposals=(lacking, replace(PAIR, form_gain=0.01, form_log_gain=0.0)))
+    row = dict(zip(names, features_of("known", evidence), strict=True))
+    lack = math.sqrt(gain * min(log_gain, 1.0))
+    assert row["lack_of_fit"] == pytest.approx(math.log(1.0 + lack / FORM_SHARE) / 3.0)
+    assert row["form_z"] == pytest.approx(0.5)
+    chances = [probabilities(replace(GOOD, proposals=(each,))).known for each in (ALONE, lacking)]
+    assert chances[1] < chances[0]
+
+
+@pytest.mark.parametrize(
+    ("effect", "by_definition"), [("creep", True), ("creep", False), ("drift", True)]
+)
+def test_what_is_a_formula_by_definition_is_refuted_by_its_relaxed_form(effect, by_definition):
+    """Its quantile, 2.4 of 3, counts once more for the best single proposal, and for no other."""
+    place = [feature.name for feature in FEATURES["known"]].index("definition_z")
+    effects = (replace(CREEP, effect=effect, by_definition=by_definition), LAG)
+    proposals = (replace(ALONE, form_z=2.4), replace(PAIR, form_z=3.0))
+    row = features_of("known", replace(GOOD, effects=effects, proposals=proposals))
+    assert row[place] == pytest.approx(0.8 if effect == "creep" and by_definition else 0.0)
+
+
+def test_a_second_effect_that_few_motions_show_puts_neither_of_the_two_first():
+    """What the second explains counts by its quantile, 1.5 of 3 here; none where it is chance."""
+    place = [feature.name for feature in FEATURES["first"]].index("proposed")
+    for z, share in ((0.0, 0.0), (1.5, 0.5), (9.0, 1.0)):
+        pair = replace(PAIR, effects=("creep", "line_lag"), own_gain=0.6, own_z=z)
+        evidence = replace(GOOD, proposals=(replace(ALONE, gain=0.8), pair))
+        rows = features_of("first", evidence)
+        assert rows[:, place] == pytest.approx(0.6 * share * 0.2 / 0.22)
+
+
+def test_a_sudden_turn_speaks_against_an_effect_that_moves_the_base():
+    chances = [
+        probabilities(replace(GOOD, sudden_log_gain=gain, sudden_margin=margin)).known
+        for gain, margin in ((-0.5, -4.0), (0.0, 0.0), (0.1, 3.0), (0.8, 9.0))
+    ]
+    assert chances[0] == chances[1] > chances[2] >= chances[3]
+
+
 def test_the_weights_in_force_have_the_signs_of_their_features():
     model = load_decision()
     for name, features in FEATURES.items():
@@ -352,6 +397,7 @@ def test_features_are_finite_of_order_one():
     [
         (lambda v: v["models"]["missing"]["weights"].update(above_floor=99.0), "hash"),
         (lambda v: v.update(schema=99), "schema 99"),
+        (lambda v: v.update(schema=SCHEMA - 1), f"expected {SCHEMA}; fit it again"),
         (lambda v: v["models"]["missing"]["weights"].pop("above_floor"), "hash"),
     ],
 )
@@ -388,28 +434,6 @@ def test_an_asset_with_its_hash_but_no_numbers_is_refused(tmp_path, change, told
     bad.write_text(json.dumps(values | {"sha256": content_hash(values)}))
     with pytest.raises(InputError, match=told):
         load_decision(bad)
-
-
-def test_an_asset_of_the_first_schema_still_opens(tmp_path):
-    """Without calibration; the features that are newer have no weight."""
-    values = json.loads(ASSET.read_text())
-    for name, features in FEATURES.items():
-        for feature in features:
-            if feature.since > 1:
-                values["models"][name]["weights"].pop(feature.name, None)
-    for key in ("calibration", *CHOSEN_COSTS):
-        values.pop(key, None)
-    values |= {"schema": 1}
-    old = tmp_path / "decision.json"
-    old.write_text(json.dumps(values | {"sha256": content_hash(values)}))
-    model = load_decision(old)
-    assert (model.curves, model.worth) == ({}, Worth())
-    newer = [feature.since > 1 for feature in FEATURES["missing"]]
-    assert any(newer)
-    weights = np.array(model.models["missing"].weights)
-    assert not weights[newer].any()
-    assert weights[~np.array(newer)].any()
-    assert decide(GOOD, model).kind == "identified"
 
 
 def test_an_asset_of_other_features_is_refused(tmp_path):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from surgisoft.cli import run
-from surgisoft.diagnosis.diagnose import diagnose, would_explain
+from surgisoft.diagnosis.diagnose import diagnose, knock, would_explain
 from surgisoft.diagnosis.residuals import Floor, held_out_rows, residual_table
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import save_recording
@@ -197,6 +197,18 @@ def test_what_would_explain_an_error_of_the_fit_is_told(effect, kind, chance, si
     assert len(checks) == (told is not None)
     assert told is None or told in checks[0]
     assert told is None or ("fit --effects" in checks[0]) == (effect == "creep")
+
+
+def test_a_knock_is_told_where_a_turn_at_one_moment_explains_more(found):
+    """A frame that was turned from the beginning is no knock; one with a margin of 3 is."""
+    turned = found["misalignment"].statistics
+    assert turned.sudden_margin < 0.0
+    assert knock(turned) == ""
+    assert found["creep"].statistics.sudden_log_gain == 0.0
+    defined = {row.effect for row in turned.effects if row.by_definition}
+    assert defined == {"misalignment", "gain_mismatch"}
+    told = knock(replace(turned, sudden_margin=3.0))
+    assert told.endswith("at one moment, as by a knock, explains more than misalignment")
 
 
 def test_steady_state_samples_rank_no_rates(tmp_path, capsys):

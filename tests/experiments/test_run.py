@@ -1,4 +1,7 @@
-"""Whole runs: interrupted or not, by one process or two, give the same rows and one report."""
+"""Whole runs: interrupted or not, they give the same rows and one report.
+
+Two processes give the same, too: `tests/cli/test_effect_files.py`, with an effect of the user.
+"""
 
 import json
 import shutil
@@ -70,14 +73,6 @@ def test_an_interrupted_run_goes_on_where_it_stopped(whole, tmp_path):
     run_experiment(spec, tmp_path / "r", report=lambda done, total, note: began.append(done))
     assert began[0] == 1.0
     assert _rows(tmp_path / "r") == _rows(folder)
-
-
-def test_two_processes_give_the_same_rows(whole, tmp_path):
-    file, folder = whole
-    spec = load_experiment(file)
-    open_results(spec, tmp_path / "r")
-    rows = run_experiment(spec, tmp_path / "r", processes=2)
-    assert rows == _rows(folder)
 
 
 def test_results_are_not_overwritten(whole, tmp_path, capsys):

@@ -241,6 +241,76 @@ def test_a_stop_from_another_thread_vents_before_the_program_notices():
     assert len(bench.sent) == 1
 
 
+def test_a_command_that_hangs_does_not_hold_up_the_emergency_stop():
+    """The driver is inside `command` and never comes back; the stop vents all the same."""
+    inside, released = threading.Event(), threading.Event()
+
+    class Hanging(Valves):
+        def command(self, pressures):
+            inside.set()
+            released.wait(30.0)
+
+    bench = Hanging()
+    rig = SafeRig(bench)
+    hanging = threading.Thread(target=rig.command, args=([10.0, 10.0],))
+    hanging.start()
+    assert inside.wait(30.0)
+    began = time.monotonic()
+    rig.stop("a door was opened")
+    assert time.monotonic() - began < 10.0
+    assert bench.vents == 1
+    released.set()
+    hanging.join()
+    with pytest.raises(RigStopped, match="a door was opened"):
+        rig.read()
+
+
+def test_the_first_reason_of_a_stop_counts_and_nothing_is_commanded_after_it():
+    bench = Valves()
+    rig = SafeRig(bench)
+    rig.stop("first")
+    rig.stop("second")
+    for call in (rig.read, rig.reset, lambda: rig.command([1.0, 1.0]), lambda: rig.wait(1.0)):
+        with pytest.raises(RigStopped, match="first"):
+            call()
+    assert (bench.vents, bench.sent) == (1, [])
+
+
+def test_a_signal_does_not_break_off_the_venting():
+    """A second one after the one that ended the run, and one at the end of a whole run."""
+
+    class Slow(Valves):
+        def vent(self):
+            os.kill(os.getpid(), signal.SIGINT)
+            super().vent()
+
+    def signalled(rig):
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(30.0)
+
+    bench = Slow()
+    with pytest.raises(Terminated):
+        run(bench, signalled)
+    assert (bench.vents, bench.closes) == (1, 1)
+    bench = Slow()
+    with SafeRig(bench):
+        pass
+    assert (bench.vents, bench.closes) == (1, 1)
+
+
+def test_an_error_of_the_program_stays_that_error_where_venting_fails():
+    class Cut(Valves):
+        def vent(self):
+            raise OSError("port is gone")
+
+    for error, raised, message in (
+        (ZeroDivisionError("own"), ZeroDivisionError, "own"),
+        (InputError("no such point"), RigStopped, r"no such point; the rig could not be vented"),
+    ):
+        with pytest.raises(raised, match=message), SafeRig(Cut()):
+            raise error
+
+
 def test_a_driver_that_cannot_be_reached_says_that_its_watchdog_has_to_vent():
     class Cut(Valves):
         def vent(self):
@@ -265,9 +335,25 @@ def test_a_clock_that_goes_back_stops_the_run():
         rig.read()
 
 
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"lowest": 5.0, "highest": 5.0}, "lowest is 5 and highest is 5"),
+        ({"rate": -1.0}, "rate is -1.0, expected 0 or a number above 0"),
+        ({"rate": np.nan}, "rate is nan"),
+        ({"hold_ms": 0.0}, "hold_ms is 0 and vent_ms is 2000"),
+        ({"hold_ms": 300.0, "vent_ms": 200.0}, "expected 0 < hold_ms <= vent_ms"),
+        ({"vent_ms": np.inf}, "vent_ms is inf"),
+    ],
+)
+def test_safety_that_makes_no_sense_is_refused(given, message):
+    with pytest.raises(InputError, match=message):
+        Safety(**given)
+
+
 def test_limits_that_make_no_sense_are_refused():
-    with pytest.raises(InputError, match="lowest is 5 and highest is 5"):
-        Safety(lowest=5.0, highest=5.0)
+    with pytest.raises(InputError, match=r"lowest 60 and highest inf kPa leave nothing of .* 50 k"):
+        SafeRig(Valves(), Safety(lowest=60.0))
     valves = Valves()
     for limits in ([[0.0, np.nan], [0.0, 1.0]], [[0.0, 1.0]]):
         valves.limits = np.array(limits)

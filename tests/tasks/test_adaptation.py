@@ -1,5 +1,6 @@
 """Online adaptation: the disturbance of an arm's key points is learned while the arm moves."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ import torch
 
 from surgisoft.errors import InputError
 from surgisoft.surrogate.checkpoint import default_arm
+from surgisoft.surrogate.reach import steady_key_points
 from surgisoft.tasks.world.adaptation import AdaptationPrior, DisturbanceEstimator
 from surgisoft.tasks.world.arm import Randomisation
 from surgisoft.tasks.world.observer import AlphaBetaFilter
@@ -30,11 +32,20 @@ def pressures(steps, seed=0):
     return torch.tensor(np.random.default_rng(seed).uniform(-10.0, 45.0, (steps, 1, 3))).float()
 
 
-def learned(estimator, off, at):
-    """The memory after disturbances (T, B, n, 3) mm at pressures (T, B, m), and the estimates."""
+def still(estimator):
+    """(1, n, 3) mm: the model's key points at rest."""
+    return (estimator.rest_mm @ estimator.shapes.mT).unflatten(1, (-1, 3))
+
+
+def learned(estimator, off, at, bodies=None):
+    """The memory after disturbances (T, B, n, 3) mm at pressures (T, B, m), and the estimates.
+
+    bodies: (T, B, n, 3) mm, the model's key points; None: they stand still at rest.
+    """
     memory, found = estimator.start(off.shape[1]), []
-    for each, pressure in zip(off, at, strict=True):
-        memory, now = estimator.updated(memory, each, pressure)
+    bodies = still(estimator).expand(len(off), off.shape[1], -1, -1) if bodies is None else bodies
+    for each, pressure, body in zip(off, at, bodies, strict=True):
+        memory, now, _ = estimator.updated(memory, each, pressure, body)
         found.append(now)
     return memory, torch.stack(found)
 
@@ -89,14 +100,100 @@ def test_a_lost_key_point_is_stood_in_for_by_what_is_expected(model):
     expected = estimator.expected(memory, at[0])
     lost = expected.clone()
     lost[0, 2] = torch.nan
-    after, now = estimator.updated(memory, lost, at[0])
+    after, now, _ = estimator.updated(memory, lost, at[0], still(estimator))
     torch.testing.assert_close(now, expected, atol=1e-5, rtol=0.0)
     torch.testing.assert_close(after.mean[..., :-1], memory.mean[..., :-1], atol=1e-5, rtol=0.0)
+
+
+THINS = 1.5
+"""Rate at which the wall of `moved` gives way, 1/s, for each mm that the body lacks."""
+
+
+def relaxed(lack):
+    """What a wall with a force like the root of its rate lacks 0.1 s later: l' = -`THINS` |l| l."""
+    return lack / (1.0 + 0.1 * THINS * lack.norm())
+
+
+def moved(model, estimator, share):
+    """Bodies (T, 1, n, 3) mm of steps of pressure every 2 s, what they lack of them because a share
+    of the motion comes late in a viscous wall, and pressures (T, 1, m) kPa; every 0.1 s."""
+    at = (0.3 * pressures(15, 5) + 20.0).repeat_interleave(20, 0)
+    bodies = torch.tensor(steady_key_points(model, at[:, 0].numpy()), dtype=torch.float32)[:, None]
+    before = still(estimator)
+    lack, off = torch.zeros_like(before), []
+    for body in bodies:
+        lack, before = relaxed(lack + body - before), body
+        off.append(-share * lack)
+    return bodies, torch.stack(off), at
+
+
+@pytest.mark.parametrize("share", [0.0, 0.7, 1.3])
+def test_the_share_of_the_motion_that_comes_late_is_learned(model, share):
+    """Of a wall that is none of `LAGS`; above 1 the body first goes the wrong way."""
+    estimator = DisturbanceEstimator(model, 0.1)
+    bodies, off, at = moved(model, estimator, share)
+    memory, _ = learned(estimator, off, at, bodies)
+    found = float(estimator.late_share(memory.mean, memory.covariance))
+    assert found == pytest.approx(share, abs=0.15)
+
+
+def test_controllers_see_late_motion_through_a_filter_where_most_of_it_is_late(model):
+    """After a step of pressure the shown disturbance follows the estimate by `filter_s`; with no
+    late motion both are one."""
+    estimator = DisturbanceEstimator(model, 0.1)
+    leads = {}
+    for share in (0.0, 1.3):
+        bodies, off, at = moved(model, estimator, share)
+        memory, _ = learned(estimator, off, at, bodies)
+        at = at[-1] + 5.0
+        body = torch.tensor(steady_key_points(model, at.numpy()), dtype=torch.float32)
+        found = estimator.updated(memory, share * (bodies[-1] - body), at, body)
+        leads[share] = float((found.lead_mm).norm()), float((bodies[-1] - body).norm())
+        after = estimator.expected(found.memory, at) - found.now_mm
+        torch.testing.assert_close(after, found.lead_mm, atol=0.05, rtol=0.0)
+    assert leads[0.0][0] < 1e-3
+    lead, step = leads[1.3]
+    assert lead == pytest.approx(1.3 * step * math.exp(-0.1 / estimator.prior.filter_s), rel=0.15)
+
+
+def loop_mm(model, late_share):
+    """Distances (T,) of the wanted motion, mm, in a loop around a wall with the late share 1.3.
+
+    In each step the controller moves the model's body along the push of one chamber by what is
+    missing as it sees the body, as deadbeat inverse kinematics does. late_share: of the prior.
+    """
+    estimator = DisturbanceEstimator(model, 0.1, AdaptationPrior(late_share=late_share))
+    memory, _ = learned(estimator, *(moved(model, estimator, 1.3)[k] for k in (1, 2, 0)))
+    at = torch.full((1, 3), 20.0)
+    body, ahead = (
+        torch.tensor(steady_key_points(model, each), dtype=torch.float32)
+        for each in (at.numpy(), at.numpy() + np.eye(3)[:1])
+    )
+    push = (ahead - body) / (ahead - body).norm()
+    place, lack, errors = 0.0, torch.zeros_like(push), []
+    for _ in range(150):
+        lack = relaxed(lack)
+        found = estimator.updated(memory, -1.3 * lack, at, body + place * push)
+        memory, seen = found.memory, found.now_mm + found.lead_mm
+        errors.append(abs(3.0 - place + 1.3 * float((lack * push).sum())))
+        change = 3.0 - place - float((seen * push).sum())
+        place, lack = place + change, lack + change * push
+    return errors
 
 
 def test_the_prior_says_what_is_wrong_with_it():
     with pytest.raises(InputError, match=r"noise_mm is 0.0, expected more than 0"):
         AdaptationPrior(noise_mm=0.0)
+
+
+def test_a_wall_that_first_moves_the_wrong_way_does_not_swing(model):
+    """Errors of the loop fall to less than half where the late share is learned."""
+    swings, calm = (
+        np.sqrt(np.mean(np.square(loop_mm(model, share)[-90:])))
+        for share in (1e-6, AdaptationPrior.late_share)
+    )
+    assert swings > 0.3
+    assert calm < 0.5 * swings
 
 
 def beam_error_mm(observer):

@@ -200,4 +200,4 @@ def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
 
 
 # A quick drift less a slow one would be none: an error from the start.
-HYPOTHESIS = Hypothesis(Drift, _grid, combinations=no_combinations)
+HYPOTHESIS = Hypothesis(Drift, _grid, combinations=no_combinations, moves_base=True)

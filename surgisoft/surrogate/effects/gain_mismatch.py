@@ -43,4 +43,4 @@ class GainMismatch(Memoryless):
         return [Quantity("gain_share", self.gain.detach().tolist(), "", -0.5, 0.5, cast)]
 
 
-HYPOTHESIS = Hypothesis(GainMismatch, measured_body="gain")
+HYPOTHESIS = Hypothesis(GainMismatch, measured_body="gain", by_definition=True)

@@ -48,6 +48,13 @@ class Hypothesis:
     exact_form: bool = False
     """Whether real arms have exactly this formula, as with a rotated frame. Then the
     effect must explain more before it is named, because nothing but noise may be left of it."""
+    by_definition: bool = False
+    """Whether the effect is its formula by definition, as a constant factor or a rotated frame. If
+    its amplitude depends on the state or the time, it is another effect; of others the formula is
+    an approximation, which many recordings refute though the name is right."""
+    moves_base: bool = False
+    """Whether the effect turns and shifts the whole body, from the beginning or gradually, as a
+    camera frame or a holder does. It is then compared with a turn at one moment (a knock)."""
     needs_motion: bool = False
     """Whether the effect shows only while the actuation moves or shortly after, as a lag does:
     steady-state samples cannot show it."""

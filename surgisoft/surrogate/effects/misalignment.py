@@ -55,4 +55,6 @@ class Misalignment(Memoryless):
         ]
 
 
-HYPOTHESIS = Hypothesis(Misalignment, exact_form=True, absent_in="new_frame")
+HYPOTHESIS = Hypothesis(
+    Misalignment, exact_form=True, absent_in="new_frame", by_definition=True, moves_base=True
+)

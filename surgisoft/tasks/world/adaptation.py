@@ -4,26 +4,33 @@ The key points differ from the model's by a disturbance, because the arm is anot
 aged, carries something, or is held otherwise. Cameras measure the disturbance with noise, and the
 direction of the tip, which a beam follows over tens of millimetres, amplifies the noise of single
 key points tenfold. A filter with one gain for all key points (`observer.AlphaBetaFilter`) has to
-choose between noise and lag. Here the disturbance is a linear function of the chambers' loads x,
+choose between noise and lag. Here the disturbance is
 
-    d = W (1, x) + r,    x = 0 at rest and 1 at the end of the range,
+    d = W (1, x) + G (z - y) + r,    x = 0 at rest and 1 at the end of the range,
 
-whose coefficients W are learned, and a transient r, a first-order Gauss-Markov process. d is
+a linear function of the chambers' loads x, motion that comes late, and a transient r, a first-order
+Gauss-Markov process. y is the body of the model, and z the same body behind the lags `LAGS`: G is
+the share of the motion that comes late, in a viscous wall or a long line. W and G are learned. d is
 resolved into orthogonal shapes of the whole body, the eigenvectors of the covariance that
 transients have: pushes of the chambers and motions of the base, which the arm's own model provides,
 have few shapes, and noise has all. For each shape a Kalman filter (Kalman 1960) estimates its row
-of W and its transient from one scalar a step: recursive least squares with forgetting (Ljung 1999,
-sec. 11.2) in which the noise of implausible shapes hardly enters. A constant disturbance of any
-shape is learned without a remaining error, because W has a constant term for each shape.
+of W and G and its transient from one scalar a step: recursive least squares with forgetting (Ljung
+1999, sec. 11.2) in which the noise of implausible shapes hardly enters. A constant disturbance of
+any shape is learned without a remaining error, because W has a constant term for each shape.
 
 The disturbance of the output is what offset-free model predictive control estimates (Pannocchia &
-Rawlings 2003). Tensors have the batch in front; the base frame is that of the arm.
+Rawlings 2003). A controller that takes back at once what it sees of the disturbance swings where
+most of the motion comes late: it corrects again what is on its way already. Where the late share is
+large, controllers therefore see G (z - y) + r behind a first-order filter, the robustness filter of
+internal model control (Garcia & Morari 1982). Tensors have the batch in front; the base frame is
+that of the arm.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -33,6 +40,29 @@ from surgisoft.errors import InputError
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.reach import steady_key_points
 
+USUAL = 0.1
+"""Distance of the body, as a share of its range, at which the time constant of a lag is stated."""
+
+
+@dataclass(frozen=True)
+class Lag:
+    """A lag of the whole body whose speed grows with the distance left, as in a thinning fluid.
+
+    z' = (y - z) / tau (1 + |y - z| / turn) / (1 + `USUAL` / turn): below `turn` the lag of Newton's
+    fluid, above it the force goes with the root of the rate, as for the effects
+    `rate_dependence` (Ellis' fluid) and, nearly, `line_lag` (turbulent flow).
+    """
+
+    tau_s: float
+    """Time constant at a distance of `USUAL`, s."""
+    turn: float
+    """Distance below which the time constant no longer grows, as a share of the body's range."""
+
+
+LAGS = (Lag(0.05, 0.01), Lag(0.3, 0.01))
+"""Lags whose shares are learned; between them, and slower for small motions, lie those of walls and
+lines. A third one of 0.8 s took up creep and friction. Chosen on robots 11 to 18 of the virtual
+rig."""
 SAMPLES = 256
 """Pressures, spread over the range of an arm, at which its Jacobian is taken (a count)."""
 PROBE = 0.01
@@ -69,6 +99,15 @@ class AdaptationPrior:
     """Correlation time of transients, s."""
     memory_s: float = 3000.0
     """Time in which W may change by its own standard deviation, s."""
+    late_share: float = 0.5
+    """Share of the body's motion that comes late by each of the lags `LAGS`, no unit."""
+    late_memory_s: float = 300.0
+    """Time in which those shares may change by their own standard deviation, s."""
+    filter_s: float = 0.5
+    """Time constant of the filter through which controllers see the disturbance where all motion
+    comes late, s; it falls to 0 at a late share of a half, where the first response is as large
+    as what follows. With 0.3 s a viscous wall still swings, with 0.8 s beams trail behind (robots
+    11 to 18 of the virtual rig)."""
 
     def __post_init__(self):
         for name, value in vars(self).items():
@@ -78,16 +117,33 @@ class AdaptationPrior:
 
 @dataclass(frozen=True, eq=False)
 class Adaptation:
-    """What was learned of B arms; D = 3 n shapes, k = m + 2 coefficients of each.
+    """What was learned of B arms; D = 3 n shapes, K lags, k = m + K + 2 coefficients of each.
 
     The coefficients are in units of their prior standard deviations, which keeps float32 exact
     enough.
     """
 
     mean: Tensor
-    """(B, D, k): constant, slope by the load of each chamber, and transient of each shape."""
+    """(B, D, k): constant, slope by the load of each chamber, share of each lag, and transient of
+    each shape."""
     covariance: Tensor
     """(B, D, k, k): covariance of their errors; the unit matrix before the first measurement."""
+    behind_mm: Tensor
+    """(B, K, D) mm: the model's body behind each lag, in shapes."""
+    shown_mm: Tensor
+    """(B, D) mm: late motion and transient as controllers see them, in shapes."""
+
+
+class Estimate(NamedTuple):
+    """What follows from a measurement of B arms."""
+
+    memory: Adaptation
+    """What is known then, as of the next step: transients have decayed, and W and G may have
+    changed."""
+    now_mm: Tensor
+    """(B, n, 3) mm, base frame: the disturbance."""
+    lead_mm: Tensor
+    """(B, n, 3) mm, base frame: what controllers are shown beyond that."""
 
 
 class DisturbanceEstimator:
@@ -107,7 +163,7 @@ class DisturbanceEstimator:
         reach = np.maximum(high - rest, rest - low)
         reach = np.where(reach > 0.0, reach, 1.0)
         pushes, shifts, turns = _covariances(model, low, high)
-        size, m = len(pushes), spec.chambers
+        size, m, lags = len(pushes), spec.chambers, len(LAGS)
         transient = (
             prior.chambers_kPa**2 * pushes
             + prior.shift_mm**2 * shifts
@@ -116,14 +172,18 @@ class DisturbanceEstimator:
         )
         variance, shapes = np.linalg.eigh(transient)
         gain_mm2 = np.einsum("ij,jk,ki->i", shapes.T, pushes, shapes)
-        first = np.empty((size, m + 2))
+        first = np.empty((size, m + lags + 2))
         first[:, 0] = prior.constant_mm**2
-        first[:, 1:-1] = prior.slope_mm**2 + gain_mm2[:, None] * (prior.gain_share * reach) ** 2
+        slopes = prior.slope_mm**2 + gain_mm2[:, None] * (prior.gain_share * reach) ** 2
+        first[:, 1 : m + 1] = slopes
+        first[:, m + 1 : -1] = prior.late_share**2
         first[:, -1] = variance
-        keep = np.ones(m + 2)
+        keep = np.ones(m + lags + 2)
         keep[-1] = math.exp(-dt_s / prior.transient_s)
-        grows = np.full(m + 2, dt_s / prior.memory_s)
+        grows = np.full(m + lags + 2, dt_s / prior.memory_s)
+        grows[m + 1 : -1] = dt_s / prior.late_memory_s
         grows[-1] = 1.0 - keep[-1] ** 2
+        tau_s, turn = np.array([(lag.tau_s, lag.turn) for lag in LAGS]).T
 
         def tensor(values: np.ndarray) -> Tensor:
             return torch.tensor(values, dtype=torch.float32, device=device)
@@ -131,29 +191,50 @@ class DisturbanceEstimator:
         self.shapes, self.rest, self.reach = tensor(shapes), tensor(rest), tensor(reach)
         self.deviation, self.keep = tensor(np.sqrt(first)), tensor(keep)
         self.kept, self.growth = self.keep[:, None] * self.keep, torch.diag(tensor(grows))
+        self.dt_s, self.steady, self.late = dt_s, m + 1, slice(m + 1, m + 1 + lags)
+        self.left = tensor(np.exp(-dt_s / tau_s / (1.0 + USUAL / turn)))[:, None]
+        self.turn_mm = tensor(turn * _range_mm(model, low, high))[:, None]
+        self.rest_mm = tensor(steady_key_points(model, rest[None]).reshape(1, -1)) @ self.shapes
 
     def start(self, count: int) -> Adaptation:
-        """Memory of `count` arms of which nothing was measured yet."""
+        """Memory of `count` arms at rest of which nothing was measured yet."""
         size, k = self.deviation.shape
         covariance = torch.eye(k, device=self.keep.device).expand(count, size, k, k).clone()
-        return Adaptation(torch.zeros_like(covariance[..., 0]), covariance)
+        behind = self.rest_mm.expand(count, len(LAGS), size).clone()
+        return Adaptation(
+            torch.zeros_like(covariance[..., 0]), covariance, behind, torch.zeros_like(behind[:, 0])
+        )
 
     def expected(self, memory: Adaptation, pressure: Tensor) -> Tensor:
-        """(B, n, 3) mm, base frame: the disturbance that is expected at pressures (B, m) kPa."""
-        return self._body((memory.mean * self._inputs(pressure)).sum(2))
+        """(B, n, 3) mm, base frame: the disturbance that controllers expect at (B, m) kPa."""
+        some = slice(0, self.steady)
+        known = memory.mean[..., some] * self._loads(pressure) * self.deviation[:, some]
+        transient = memory.mean[..., -1] * self.deviation[:, -1]
+        decayed = (1.0 / self.keep[-1] - 1.0) * transient
+        return self._body(known.sum(2) + memory.shown_mm - decayed)
 
     def updated(
-        self, memory: Adaptation, off_mm: Tensor, pressure: Tensor, samples: int = 1
-    ) -> tuple[Adaptation, Tensor]:
-        """Memory after a measurement, and the disturbance (B, n, 3) mm, base frame, as estimated.
+        self,
+        memory: Adaptation,
+        off_mm: Tensor,
+        pressure: Tensor,
+        points_mm: Tensor,
+        samples: int = 1,
+        settled: bool = False,
+    ) -> Estimate:
+        """What is known after a measurement.
 
         off_mm: (B, n, 3) mm, base frame: measured key points less the model's, nan where one was
-        lost; the expected disturbance stands in for it. pressure: (B, m) kPa. samples: number of
-        measurements at these pressures whose mean `off_mm` is. The memory returned
-        is that of the next step: transients have decayed, and W may have changed.
+        lost; the expected disturbance stands in for it. pressure: (B, m) kPa. points_mm:
+        (B, n, 3) mm, base frame: the model's key points. samples: number of measurements at these
+        pressures whose mean `off_mm` is. settled: whether the arm has stood there so long that
+        nothing comes late any more.
         """
-        inputs = self._inputs(pressure)
-        expected = self.expected(memory, pressure)
+        body = points_mm.flatten(1) @ self.shapes
+        gap = self._gap(memory.behind_mm - body[:, None])
+        gap = torch.zeros_like(gap) if settled else gap
+        inputs = self._inputs(pressure, gap)
+        expected = self._body((memory.mean * inputs).sum(2))
         surprise = torch.where(off_mm.isfinite(), off_mm - expected, torch.zeros_like(expected))
         scalar = surprise.flatten(1) @ self.shapes
         across = (memory.covariance * inputs[:, :, None]).sum(3)
@@ -161,14 +242,48 @@ class DisturbanceEstimator:
         gain = across / power[..., None]
         mean = memory.mean + gain * scalar[..., None]
         covariance = memory.covariance - gain[..., None] * across[:, :, None]
-        now = self.expected(Adaptation(mean, covariance), pressure)
-        return Adaptation(mean * self.keep, covariance * self.kept + self.growth), now
+        terms = mean * inputs
+        passing = terms[..., self.steady :].sum(2)
+        adopts = self._adopts(mean, covariance)
+        shown = memory.shown_mm + adopts * (passing - memory.shown_mm)
+        after = Adaptation(
+            mean * self.keep, covariance * self.kept + self.growth, gap + body[:, None], shown
+        )
+        return Estimate(after, self._body(terms.sum(2)), self._body(shown - passing))
 
-    def _inputs(self, pressure: Tensor) -> Tensor:
-        """(B, D, k) mm: what the coefficients are multiplied with."""
+    def late_share(self, mean: Tensor, covariance: Tensor) -> Tensor:
+        """(B,): share of the body's motion that comes late by all lags together.
+
+        The mean over the shapes, each weighted by the inverse variance of its own share. mean,
+        covariance: as those of `Adaptation`.
+        """
+        scale = self.deviation[:, self.late]
+        share = (mean[..., self.late] * scale).sum(2)
+        spread = covariance[..., self.late, self.late] * scale[:, :, None] * scale[:, None]
+        weight = 1.0 / spread.sum((2, 3))
+        return (share * weight).sum(1) / weight.sum(1)
+
+    def _adopts(self, mean: Tensor, covariance: Tensor) -> Tensor:
+        """(B, 1): share of a new disturbance that controllers are shown in this step."""
+        beyond = (2.0 * self.late_share(mean, covariance) - 1.0).clamp(0.0, 1.0)[:, None]
+        time_s = (self.prior.filter_s * beyond).clamp(min=1e-3 * self.dt_s)
+        return 1.0 - torch.exp(-self.dt_s / time_s)
+
+    def _gap(self, gap: Tensor) -> Tensor:
+        """(B, K, D) mm: what a step leaves of the distances behind the body, by `Lag`, exactly."""
+        size = gap.norm(dim=2, keepdim=True)
+        return gap * self.left / (1.0 + (1.0 - self.left) * size / self.turn_mm)
+
+    def _loads(self, pressure: Tensor) -> Tensor:
+        """(B, 1, m + 1): 1 and the loads of the chambers."""
         load = (pressure - self.rest) / self.reach
-        one = torch.ones_like(load[:, :1])
-        return torch.cat((one, load, one), 1)[:, None] * self.deviation
+        return torch.cat((torch.ones_like(load[:, :1]), load), 1)[:, None]
+
+    def _inputs(self, pressure: Tensor, gap: Tensor) -> Tensor:
+        """(B, D, k) mm: what the coefficients are multiplied with; gap: (B, K, D) mm."""
+        gap = gap.mT
+        load = self._loads(pressure).expand(-1, gap.shape[1], -1)
+        return torch.cat((load, gap, torch.ones_like(gap[..., :1])), 2) * self.deviation
 
     def _body(self, shares: Tensor) -> Tensor:
         """(B, n, 3) mm, base frame, of shares (B, D) of the shapes."""
@@ -199,6 +314,17 @@ def _covariances(
         shifts.append(np.broadcast_to(axis, points.shape))
         turns.append(np.cross(axis, points))
     return _moment(slopes), _moment(shifts), _moment(turns)
+
+
+def _range_mm(model: ArmModel, low: np.ndarray, high: np.ndarray) -> float:
+    """Largest distance of the body from its mean over the range of the arm, mm.
+
+    The root of the sum over the key points of their squared distances.
+    """
+    share = torch.quasirandom.SobolEngine(model.spec.chambers).draw(SAMPLES).double().numpy()
+    points = steady_key_points(model, low + (high - low) * share)
+    off = (points - points.mean(0)).reshape(SAMPLES, -1)
+    return float(np.linalg.norm(off, axis=1).max())
 
 
 def _moment(displacements: list[np.ndarray]) -> np.ndarray:

@@ -162,6 +162,9 @@ class ArmPart:
     None where the model moves it. Resets and row selections carry it like any tensor."""
     belief: Belief | None = None
     """Memory of the observer of a simulated arm; None where its estimate is the raw measurement."""
+    lead_mm: Tensor | None = None
+    """(B, n, 3) mm: by how much controllers see the key points ahead of the estimate `seen_mm`,
+    because motion comes late (`adaptation`); None without an observer that learns."""
     factors: Tensor | None = None
     """(B, K): factors of the episode's random effects; None without any."""
 
@@ -169,6 +172,11 @@ class ArmPart:
     def model_beside(self) -> ArmState:
         """State of the model that runs beside the arm, fed with what is measured."""
         return self.arm if self.belief is None else self.belief.arm
+
+    @property
+    def steered_mm(self) -> Tensor:
+        """(B, n, 3) mm: key points that controllers lead to their targets."""
+        return self.seen_mm if self.lead_mm is None else self.seen_mm + self.lead_mm
 
     @property
     def tip_mm(self) -> Tensor:
@@ -346,14 +354,14 @@ class ModelArm:
             stream, noise = stream.normal(self.key_points, 3)
             seen = frames.apply(mount, at) + vary.noise_mm / math.sqrt(STOOD) * noise
             off = (seen - frames.apply(self.pose, shape)) @ self.pose[:3, :3]
-            learned, _ = self._learner.updated(learned, off, target, STOOD)
+            learned = self._learner.updated(learned, off, target, shape, STOOD, True).memory
         offset = part.seen_mm - frames.apply(self.pose, shape)
         zero = torch.zeros_like(offset)
         belief = Belief(nominal, offset, zero, zero[:, :1])
         if self._learner is not None:
             belief = replace(belief, adaptation=learned, offset_mm=zero)
-            now, belief = self._learned(belief, offset, part.seen_kPa)
-            part = replace(part, seen_mm=part.seen_mm - offset + now)
+            now, lead, belief = self._learned(belief, offset, part.seen_kPa, shape)
+            part = replace(part, seen_mm=part.seen_mm - offset + now, lead_mm=lead)
         return stream, replace(part, belief=belief)
 
     def step(
@@ -557,26 +565,30 @@ class ModelArm:
         belief = part.belief
         if belief is None:
             return part
-        arm, points = self._advanced(belief.arm, part.seen_kPa, dt_s)
-        points = frames.apply(self.pose, points) + belief.fed_mm
-        off = part.seen_mm - points
+        arm, shape = self._advanced(belief.arm, part.seen_kPa, dt_s)
+        points = frames.apply(self.pose, shape) + belief.fed_mm
+        off, lead = part.seen_mm - points, None
         belief = replace(belief, arm=arm)
         if belief.adaptation is None:
             before = belief.offset_mm, belief.drift_mm
             now, offset, drift = self.observer.adopted(off - belief.offset_mm, *before)
             belief = replace(belief, offset_mm=offset, drift_mm=drift)
         else:
-            now, belief = self._learned(belief, off, part.seen_kPa)
-        return replace(part, seen_mm=points + now, belief=belief)
+            now, lead, belief = self._learned(belief, off, part.seen_kPa, shape)
+        return replace(part, seen_mm=points + now, lead_mm=lead, belief=belief)
 
-    def _learned(self, belief: Belief, off: Tensor, pressure: Tensor) -> tuple[Tensor, Belief]:
-        """Disturbance now (B, n, 3) mm, world frame, and the belief after a measurement `off`."""
+    def _learned(
+        self, belief: Belief, off: Tensor, pressure: Tensor, shape: Tensor
+    ) -> tuple[Tensor, Tensor, Belief]:
+        """Disturbance now and what controllers see beyond it, each (B, n, 3) mm, world frame, and
+        the belief after a measurement `off`; shape: (B, n, 3) mm, base frame, of the model."""
         assert self._learner is not None
         assert belief.adaptation is not None
         turn = self.pose[:3, :3]
-        memory, now = self._learner.updated(belief.adaptation, off @ turn, pressure)
+        memory, now, lead = self._learner.updated(belief.adaptation, off @ turn, pressure, shape)
         offset = self._learner.expected(memory, pressure) @ turn.mT
-        return now @ turn.mT, replace(belief, adaptation=memory, offset_mm=offset)
+        belief = replace(belief, adaptation=memory, offset_mm=offset)
+        return now @ turn.mT, lead @ turn.mT, belief
 
 
 class LoneArm:

@@ -58,7 +58,7 @@ TIMED: tuple[tuple[Any, str, str], ...] = (
     (ModelArm, "step", "arms"),
     (ModelArm, "predict", "arms"),
     (BatchedScene, "clearance", "clearance"),
-    (SceneEngine, "aimed", "beam"),
+    (SceneEngine, "_aimed", "beam"),
     (scene_module, "seen_from", "view"),
     (AblationMap, "advance", "dose"),
     (AblationMap, "report", "dose"),

@@ -432,6 +432,9 @@ def live(
     hours: Annotated[
         float, typer.Option(min=0.2, help="Hours of clean rig for each robot and motion.")
     ] = 5.0,
+    changed: Annotated[
+        str, typer.Option(help="Seeds of the robots on which effects begin; default: all.")
+    ] = "",
     models: Work = Path("runs/benchmark-live"),
     processes: Processes = 2,
     output: Output = None,
@@ -446,11 +449,13 @@ def live(
     check_folder(models)
     numbers = _numbers("--robots", robots)
     with _kept("live", models) as report:
-        clean, changes = run(numbers, hours, models, processes, report)
+        some = _numbers("--changed", changed) if changed else numbers
+        clean, changes = run(numbers, some, hours, models, processes, report)
     if json_file:
         both = {"clean": [asdict(c) for c in clean], "changes": [asdict(c) for c in changes]}
         write_json(json_file, both)
     command = f"surgisoft benchmark live --robots {robots} --hours {hours:g}"
+    command += f" --changed {changed}" if changed else ""
     _show("Live: false alarms and delays", command, markdown(clean, changes), output)
 
 

@@ -82,10 +82,6 @@ class Setting:
     """`white`, `loud` (threefold) or `correlated`."""
     rows: int = 3000
     """Rows of a recording at 20 Hz."""
-    shape: bool = False
-    """Whether the nonlinear parameters are drawn that recordings hardly show, too: a prior holds
-    those near its centre, and an interval of such a one holds 95 % of the true values on average
-    over the prior (Rubin 1984; Cook, Gelman & Rubin 2006), and more of those at its centre."""
 
 
 SETTINGS = (
@@ -93,7 +89,6 @@ SETTINGS = (
     Setting("gain, own law, correlated noise", "gain_mismatch", "own", 0.2, "correlated"),
     Setting("misalignment, own law", "misalignment", "own", 0.2),
     Setting("creep, own law", "creep", "own", 0.2),
-    Setting("creep, own law, spectrum and power drawn", "creep", "own", 0.2, shape=True),
     Setting("line lag, own law", "line_lag", "own", 0.2),
     Setting("payload, the rig's law", "payload", "rig", 0.0),
     Setting("gain, the rig's law", "gain_mismatch", "rig", 0.0),
@@ -185,7 +180,7 @@ def run_case(case: Case, folder: Path) -> Outcome:
         model = bent(base, case.robot, setting.bent_mm, case.take)
     true: dict[str, np.ndarray] = {}
     if setting.law == "own":
-        effect = drawn_effect(case.effect, base, case.take, setting.shape)
+        effect = drawn_effect(case.effect, base, case.take)
         recording = own_recording(case, base, effect)
         true = {q.name: np.ravel(q.value) for q in effect.quantities()}
     else:
@@ -241,10 +236,12 @@ def noisy(case: Case, recording: Recording) -> Recording:
 
 
 @torch.no_grad()
-def drawn_effect(name: str, base: ArmModel, seed: int, shape: bool = False) -> Effect:
+def drawn_effect(name: str, base: ArmModel, seed: int) -> Effect:
     """The named effect at values drawn from a seed, each within its plausible range.
 
-    shape: see `Setting.shape`.
+    Nonlinear parameters that recordings hardly show are drawn, too: a prior holds those near its
+    centre, and an interval of such a one holds 95 % of the true values on average over the prior
+    (Rubin 1984; Cook, Gelman & Rubin 2006), and more of those at its centre.
     """
     rng = np.random.default_rng([seed, 2])
     facts = base.facts
@@ -269,11 +266,14 @@ def drawn_effect(name: str, base: ArmModel, seed: int, shape: bool = False) -> E
         effect = make_effect(name, facts, width=log_uniform(0.05, 0.25))
         effect.threshold.copy_(torch.tensor(rng.uniform(0.02, 0.06, effect.threshold.shape)))
     elif name == "creep":
-        effect = make_effect(name, facts, tau_s=log_uniform(4.0, 30.0), width=1.5)
+        effect = make_effect(
+            name,
+            facts,
+            tau_s=log_uniform(4.0, 30.0),
+            width=log_uniform(0.3, 4.5),
+            power=log_uniform(0.5, 2.0),
+        )
         effect.amount.copy_(torch.tensor(rng.uniform(0.04, 0.12, effect.amount.shape)))
-        if shape:
-            effect.log_width.fill_(math.log(log_uniform(0.3, 4.5)))
-            effect.log_power.fill_(math.log(log_uniform(0.5, 2.0)))
     elif name == "line_lag":
         up = log_uniform(0.15, 0.5)
         effect = make_effect(name, facts, up_s=up, down_s=log_uniform(1.0, 2.0) * up)

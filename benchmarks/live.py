@@ -82,7 +82,7 @@ class Clean:
     highest: float
     """Highest alarm level in the whole time; 1 raises the alarm."""
     judged_h: float
-    """Time in which the reference covered the motion [h]."""
+    """Time in which the reference covered the motion [h]; 0 also where it was refused."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +107,8 @@ class Change:
     """Time from the change to the alarm [s]; None: no alarm within AFTER_S."""
     early: int
     """False alarms before the change."""
+    judges: bool
+    """Whether the reference was taken, and not refused because it repeats too little."""
 
 
 def circles(minutes: float, rng: np.random.Generator) -> Protocol:
@@ -205,7 +207,8 @@ def change(robot: int, motion: str, effect: str, strength: float, folder: Path) 
         late = [alarm.at_s - CHANGE_S for alarm in charts.alarms if alarm.at_s >= CHANGE_S]
         early = len(charts.alarms) - len(late)
         delay = late[0] if late else None
-        found.append(Change(robot, motion, name, effect, strength, *sizes, delay, early))
+        about = robot, motion, name, effect, strength, *sizes
+        found.append(Change(*about, delay, early, judge.judges))
     return found
 
 
@@ -236,14 +239,19 @@ def kept_change(
 
 
 def run(
-    robots: Sequence[int], hours: float, folder: Path, processes: int, report: Progress
+    robots: Sequence[int],
+    changed: Sequence[int],
+    hours: float,
+    folder: Path,
+    processes: int,
+    report: Progress,
 ) -> tuple[list[Clean], list[Change]]:
-    """Both studies on every robot."""
+    """Hours of clean rig of the robots, and effects that begin on those of `changed`."""
     clean: list[Clean] = []
     changes: list[Change] = []
-    for robot in robots:
+    for robot in sorted({*robots, *changed}):
         base_model(robot, folder)
-    cases = list(itertools.product(robots, CHANGES))
+    cases = list(itertools.product(changed, CHANGES))
     with workers(processes) as pool:
         jobs = {
             pool.submit(kept_clean, r, m, hours, folder): clean for r in robots for m in MOTIONS
@@ -277,14 +285,16 @@ def markdown(clean: Sequence[Clean], changes: Sequence[Change]) -> str:
         most = 0.5 * chi2.ppf(0.975, 2 * (alarms + 1))
         levels = ", ".join(f"{c.robot}: {c.highest:.2f} ({c.alarms})" for c in some)
         words = "recording" if reference == "before" else f"first {CLEAN_S:.0f} s"
+        rate = "- | -"
+        if judged:
+            rate = f"{alarms / judged:.2f} | {least / judged:.2f} to {most / judged:.2f}"
         lines.append(
-            f"| {motion} | {words} | {hours:.1f} | {judged:.1f} | {alarms} | {alarms / judged:.2f} "
-            f"| {least / judged:.2f} to {most / judged:.2f} | {levels} |"
+            f"| {motion} | {words} | {hours:.1f} | {judged:.1f} | {alarms} | {rate} | {levels} |"
         )
     lines += [
         "",
-        "Judged: the time in which the reference covers the motion. In brackets: alarms of that "
-        "robot.",
+        "Judged: the time in which the reference covers the motion; none where it repeats too "
+        "little. In brackets: alarms of that robot.",
         "",
         "## An effect begins in minute six of ten",
         "",
@@ -303,9 +313,10 @@ def markdown(clean: Sequence[Clean], changes: Sequence[Change]) -> str:
                 if (c.motion, c.effect, c.strength, c.reference)
                 == (motion, effect, strength, reference)
             ]
-            delays = sorted(c.delay_s for c in some if c.delay_s is not None)
+            taken = [c for c in some if c.judges]
+            delays = sorted(c.delay_s for c in taken if c.delay_s is not None)
             shown = ", ".join(f"{delay:.1f}" for delay in delays) or "-"
-            cells += [f"{len(delays)} of {len(some)}", shown]
+            cells += [f"{len(delays)} of {len(taken)}" if taken else "not judged", shown]
             before = np.mean([c.before_mm for c in some])
             after = np.mean([c.after_mm for c in some])
         about = f"{motion} | `{effect}` | {strength:g} | {before:.3f} | {after:.3f}"

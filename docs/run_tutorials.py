@@ -9,7 +9,7 @@ A tutorial (docs/tutorials) runs in an empty folder of its own. What a block is,
 - `python`: Python; all blocks of a page share their names;
 - any language with `title="FILE"`: the content of a file;
 - `text` behind a block that runs: what it printed, which --write renews;
-- `python needs="MODULE"`: is left out where the module is not installed, and said so.
+- `python needs="MODULE,..."`: is left out where a module is not installed, and said so.
 
 A picture of a page, `![...](images/NAME.png)`, is the file NAME.png that its blocks left in the
 folder; --write copies it, at most `MOST_PIXELS` wide.
@@ -140,8 +140,8 @@ def run_page(text: str, folder: Path, name: str) -> str:
         if title:
             (folder / title[1]).parent.mkdir(parents=True, exist_ok=True)
             (folder / title[1]).write_text(body)
-        elif needs and importlib.util.find_spec(needs[1]) is None:
-            print(f"{name}: a block was left out, {needs[1]} is not installed")
+        elif needs and (absent := not_installed(needs[1])):
+            print(f"{name}: a block was left out, {', '.join(absent)} is not installed")
         elif language == "bash":
             said = shell(body, folder, name)
         elif language == "python":
@@ -149,6 +149,11 @@ def run_page(text: str, folder: Path, name: str) -> str:
         return block[0]
 
     return BLOCK.sub(run, text)
+
+
+def not_installed(modules: str) -> list[str]:
+    """Those of the modules, with commas in between, that are not installed."""
+    return [name for name in modules.split(",") if importlib.util.find_spec(name) is None]
 
 
 def shell(lines: str, folder: Path, page: str) -> str:

@@ -40,7 +40,7 @@ surgisoft --version | cut -c1-9
 ```text
 ```
 
-```python needs="no_such_library"
+```python needs="json,no_such_library"
 raise ValueError
 ```
 

@@ -305,6 +305,6 @@ def sweep_chart(field: str, label: str, lines: Mapping[str, Sequence[tuple]]) ->
         axis.set_ylabel(label)
         axis.set_title(f"{label} over {name}")
         if len(lines) > 1:
-            axis.legend()
+            figure.legend(loc="outside lower center", ncols=3)
         band = "Lines" if apart else "Shaded"
         return chart(figure, f"{label} over {name}", f"{band}: 95 % interval of the mean")

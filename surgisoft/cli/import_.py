@@ -21,14 +21,14 @@ def import_(
         list[Path], typer.Argument(metavar="RAW", help="Raw files, or folders of them.")
     ],
     output: Annotated[
-        Path,
+        Path | None,
         typer.Option(
             "-o",
             "--output",
             metavar="REC",
             help="New recording (.csv or .parquet), or a folder with one recording per raw file.",
         ),
-    ],
+    ] = None,
     map_name: Annotated[
         str | None,
         typer.Option(
@@ -37,6 +37,14 @@ def import_(
             help="Map file, or motive, the map for files of OptiTrack Motive. The log of an "
             "interrupted recording (.jsonl), and a LeRobotDataset with a recording's names, need "
             "none.",
+        ),
+    ] = None,
+    draft: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="NEW.toml",
+            help="Write a draft of the map from the names of a text file's columns, to be checked, "
+            "and nothing else.",
         ),
     ] = None,
     force: Force = False,
@@ -73,6 +81,11 @@ def import_(
     from surgisoft.measurement.recordings.log import SUFFIX as LOG_SUFFIX
     from surgisoft.memory import keep_freed_memory
 
+    if draft is not None:
+        _draft(raw, draft, force)
+        return
+    if output is None:
+        raise InputError("-o is missing: a new recording (.csv, .parquet) or a folder for them")
     keep_freed_memory()
     arm = None
     if model:
@@ -91,7 +104,7 @@ def import_(
     elif map_name is None:
         raise InputError(
             "--map is missing: a map file states columns, units and frames; "
-            "docs/recordings.md has one to start from"
+            f"'surgisoft import {raw[0]} --draft map.toml' writes one to start from"
         )
     else:
         parts = import_files(raw, load_map(map_name), name)
@@ -113,6 +126,24 @@ def import_(
         print(f"{'would write' if dry_run else 'wrote'} {target}: {about}", *rest, sep="\n")
     if arm:
         _test_setup(arm, str(model), [part.recording for part in parts])
+
+
+def _draft(raw: list[Path], place: Path, force: bool) -> None:
+    """Write a draft of the map of a raw file."""
+    from surgisoft.files import write_atomically
+    from surgisoft.measurement.importing import draft_map
+
+    if len(raw) != 1 or raw[0].is_dir():
+        raise InputError(f"--draft: {len(raw)} raw files or a folder, expected one text file")
+    if place.suffix != ".toml":
+        raise InputError(f"{place}: suffix '{place.suffix}', expected .toml")
+    if place.exists() and not force:
+        raise InputError(f"{place}: exists already; choose another name or use --force")
+    text = draft_map(raw[0])
+    write_atomically(place, text)
+    checks = text.count("# check:")
+    print(f"wrote {place}: a draft; check every line, above all the {checks} marked 'check'")
+    print(f"next: surgisoft import {raw[0]} --map {place} -o REC.parquet --dry-run")
 
 
 def _test_setup(arm: "ArmModel", name: str, recordings: list) -> None:

@@ -1,6 +1,7 @@
 """Progress of long work on standard error: a bar in a terminal, occasional lines elsewhere."""
 
 import contextlib
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -8,6 +9,8 @@ from datetime import datetime, timedelta
 
 from surgisoft.progress import Progress
 
+NOTEBOOK = "JPY_PARENT_PID"
+"""Environment variable of what a cell of a notebook starts: Jupyter sets it for its kernels."""
 LINE_EVERY_S = 30.0
 """Time between two lines where there is no terminal, s."""
 
@@ -21,7 +24,8 @@ def progress(title: str) -> Iterator[Progress]:
     from rich.progress import Progress as RichProgress
 
     console = Console(stderr=True)
-    terminal = console.is_terminal and sys.stderr.isatty()  # notebooks force colours into a pipe
+    # Notebooks force colours into a pipe, and run `!command` in a pseudo-terminal.
+    terminal = console.is_terminal and sys.stderr.isatty() and NOTEBOOK not in os.environ
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),

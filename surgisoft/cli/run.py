@@ -183,13 +183,16 @@ def _show(found) -> None:
     if len(found.tracking) and not math.isnan(found.tracking_mm()):
         task = ", ".join(f"{name}{found.tracking_mm(a, b):.3f} mm" for name, a, b in stretches)
         print(f"error of the task: {task}")
-    if found.judged < 0.995:
+    taken = found.detector is not None and found.detector.judges
+    if taken and found.judged < 0.995:
         print(
             f"judged: {found.judged:.0%} of the time after the reference; the rest is motion that "
             "the reference does not cover"
         )
     if found.detector is None:
         print("no change detector: the run was shorter than its clean reference")
+    elif not taken:
+        print("no change detector: its clean reference does not repeat its motions")
     elif not found.alarms:
         level = max((x for x in found.statistic if not math.isnan(x)), default=0.0)
         print(f"no alarm; highest alarm level {level:.2f} of 1")

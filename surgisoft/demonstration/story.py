@@ -269,7 +269,8 @@ def _cut_parts(log, picture: Path | None) -> list[Part]:
         ),
     ]
     if picture is not None:
-        parts.append(Picture.from_file(picture, "The episode in the Rerun viewer", "cut.rrd"))
+        shown = "The episode in the Rerun viewer, at two thirds of its time"
+        parts.append(Picture.from_file(picture, shown, shown))
     return [*parts, *episode_parts(log)[:-1]]
 
 

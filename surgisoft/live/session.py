@@ -27,6 +27,7 @@ from surgisoft.errors import InputError, unknown_name
 from surgisoft.files import json_safe
 from surgisoft.live.change import (
     LEAST_BLOCKS,
+    LEAST_REPEATED,
     Alarm,
     AlarmDesign,
     Charts,
@@ -221,6 +222,7 @@ class RunResult:
                 "reference_mm": None if detector is None else detector.reference_mm,
                 "threshold": None if detector is None else detector.threshold,
                 "enlargement": None if detector is None else detector.enlargement,
+                "repeated": None if detector is None else detector.repeated,
                 "alarms": [vars(alarm) for alarm in self.alarms],
                 "judged": self.judged,
                 "error_mm": {
@@ -575,7 +577,7 @@ class _Session:
         if request.observer_gain is not None:
             config = replace(config, observer_gain=request.observer_gain, adapts=False)
         task = on_rig(place, config, lambda config, trial: bench)
-        policy = open_policy(request.policy, task)
+        policy = open_policy(request.policy, place)  # the bench is first moved by the loop
         _rehearse(place, policy)
         return lambda: self._follow_policy(task, policy)
 
@@ -721,6 +723,13 @@ class _Session:
             f"{detector.design.false_alarm_h:g} h"
         )
         self._event(self._early[-1].t_s if self._early else 0.0, text)
+        if not detector.judges:
+            self.on_warning(
+                f"the reference of {detector.reference_s:.0f} s does not repeat its motions: "
+                f"{detector.repeated:.0%} of it is like other parts of it, expected at least "
+                f"{LEAST_REPEATED:.0%}; no change is looked for. Give a longer one: --clean, or a "
+                "recording in the same kind of motion with --before"
+            )
         rmse = self.model.validation.rmse_mm
         if rmse is not None and detector.reference_mm > SUSPICIOUS * rmse:
             self.on_warning(
@@ -778,6 +787,7 @@ class _Session:
         """Write the recording and what belongs to it."""
         recording = log.finish(self._name) if log.samples else None
         if recording is None:
+            log.discard()
             raise InputError("the run ended before its first sample; nothing was recorded")
         charts = self.charts
         alarms = tuple(charts.alarms) if charts is not None else ()

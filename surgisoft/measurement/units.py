@@ -20,6 +20,8 @@ _KPA_PER = {
 _DEGREES_PER = {"deg": 1.0, "rad": 57.29577951308232, "rev": 360.0}
 _VOLTS_PER = {"V": 1.0, "mV": 1e-3}
 _NEWTONS_PER = {"N": 1.0, "mN": 1e-3, "kN": 1e3}
+ACTUATION_UNITS = (*_KPA_PER, *_DEGREES_PER, *_VOLTS_PER, *_NEWTONS_PER)
+"""Units of pressures, angles, voltages and forces."""
 _QUANTITIES = (_KPA_PER, _DEGREES_PER, MM_PER, _VOLTS_PER, _NEWTONS_PER)
 
 

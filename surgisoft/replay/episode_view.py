@@ -285,7 +285,7 @@ LOOKS = 40
 """Points of the work to which lines of sight are drawn (a count)."""
 MOST_HIDDEN = 0.25
 """Share of those lines that a body may cut before it is drawn see-through."""
-SEE_THROUGH = 70
+SEE_THROUGH = 50
 """Opacity of a body in front of the work, 0..255."""
 
 
@@ -457,8 +457,8 @@ def legend(log: EpisodeLog) -> str:
     ]
     lines = [f"- **{colour}**: {meaning}" for colour, meaning, shown in rows if shown]
     roles = {body.role for body in log.bodies}
-    lines += [f"- **{c}**: {role}" for role, c in ROLE_NAMES.items() if role in roles]
     lines += [f"- **see-through**: {name}, in front of the work" for name in hiding_bodies(log)]
+    lines += [f"- **{c}**: {role}" for role, c in ROLE_NAMES.items() if role in roles]
     what = f"**{log.task}** by {log.driver} in {log.on}"
     last = f": {log.events[-1].text} at {log.events[-1].time_s:.1f} s" if log.events else ""
     return f"{what}{last}.\n\n" + "\n".join(lines) + "\n"

@@ -6,14 +6,17 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from surgisoft.error_scale import bar_length
 from surgisoft.replay.colours import (
     ARM_COLOURS,
     BACKGROUND,
     BEAM_COLOUR,
     CONE_COLOUR,
     LESION_COLOUR,
+    MEASURED_COLOUR,
     PLAN_COLOUR,
     ROLE_COLOURS,
+    ROLE_NAMES,
     SHAFT_COLOUR,
 )
 from surgisoft.replay.recording import new_recording
@@ -37,6 +40,10 @@ BORE_MM = 1.5
 """Radius of the arm's channel (mm); it is 3 mm across in the paper's arm."""
 LIFT_MM = 0.5
 """Height of drawings above the surface they lie on, so that it does not hide them (mm)."""
+LEGEND = "/legend"
+"""Text that explains the colours of the 3D view."""
+BAR_SHARE = 0.3
+"""Length of the scale bar over the organ's size, before it is rounded."""
 FRAMES = 72
 """Number of frames, during which the laser goes once around the ring."""
 
@@ -50,6 +57,9 @@ def save_scene_view(scene: Scene, reaches: dict[str, ArmReach], path: Path) -> N
     with new_recording(path, "surgisoft_scene", identity, blueprint(scene, arms)) as recording:
         _log_bodies(recording, scene)
         _log_lesion(recording, scene)
+        _log_bar(recording, scene, _side_of_arms(scene, arms))
+        text = rr.TextDocument(scene_legend(scene), media_type="text/markdown")
+        recording.log(LEGEND, text, static=True)
         for name in spec.arms_with("endoscope"):
             look = look_at_lesion(arms[name], ring, spec.camera)
             _log_endoscope(recording, scene, name, arms[name], look)
@@ -70,17 +80,61 @@ def blueprint(scene: Scene, arms: dict[str, MountedArm]) -> rrb.Blueprint:
     eye = middle + 1.05 * size * frames.normalise(towards + np.array([0.0, 0.0, 0.45]))
     view = rrb.Spatial3DView(
         origin="/",
+        contents=["+ /**", f"- {LEGEND}"],
         name="Scene",
         background=rrb.Background(BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=rrb.EyeControls3D(position=eye, look_target=middle, eye_up=(0.0, 0.0, 1.0)),
     )
+    legend = rrb.TextDocumentView(origin=LEGEND, name="What is seen")
     return rrb.Blueprint(
-        view,
+        rrb.Horizontal(view, legend, column_shares=[4, 1]),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed"),
     )
+
+
+def scene_legend(scene: Scene) -> str:
+    """Markdown: what the scene has, and the colours of the 3D view."""
+    spec = scene.spec
+    names = {role: [b.name for b in scene.bodies if b.role == role] for role in ROLE_NAMES}
+    rows = [
+        (ROLE_NAMES["organ"], f"organ: {', '.join(names['organ'])}"),
+        (ROLE_NAMES["keep-out"], f"must not be touched: {', '.join(names['keep-out'])}"),
+        (ROLE_NAMES["support"], f"support: {', '.join(names['support'])}"),
+    ]
+    rows = [row for row, role in zip(rows, ROLE_NAMES, strict=True) if names[role]]
+    ring = f"ring of {scene.spec.lesion.diameter_mm:g} mm" if not spec.lesion.path_mm else "path"
+    rows.append(("yellow", f"the {ring} around the lesion"))
+    for tool, colour, sees in (
+        ("laser", "ivory", ", green: its beam"),
+        ("endoscope", "blue", ", lines: its field of view"),
+        ("tip", "pale green", ""),
+    ):
+        if arms := spec.arms_with(tool):
+            rows.append((colour, f"{', '.join(arms)}{sees}"))
+    rows.append(("dark grey", "rigid shafts"))
+    lines = "\n".join(f"- **{colour}**: {meaning}" for colour, meaning in rows)
+    note = ""
+    if spec.arms_with("laser"):
+        note = "\n\nThe timeline `ring_point` leads the beam once around the ring."
+    return f"**{spec.name}**\n\n{lines}{note}\n"
+
+
+def _log_bar(recording, scene: Scene, towards: np.ndarray) -> None:
+    """Log a bar of a round length right of the organ; towards: (3,) direction to the eye."""
+    mesh = scene.organ.world_mesh
+    low, high = mesh.bounds_mm
+    size, middle = float(np.linalg.norm(high - low)), 0.5 * (low + high)
+    length = bar_length(BAR_SHARE * size)
+    right = np.cross([0.0, 0.0, 1.0], towards)
+    beyond = float(((mesh.vertices_mm - middle) @ right).max()) + 0.08 * size
+    ends = middle + (beyond + np.array([[0.0], [length]])) * right
+    bar = rr.LineStrips3D(
+        [ends], colors=[MEASURED_COLOUR], radii=[0.004 * size], labels=[f"{length:g} mm"]
+    )
+    recording.log("/scale_bar", bar, static=True)
 
 
 def _side_of_arms(scene: Scene, arms: dict[str, MountedArm]) -> np.ndarray:

@@ -16,6 +16,7 @@ from surgisoft.tasks.inverse_kinematics import action_towards
 from surgisoft.tasks.observations import (
     Block,
     ObservationBlocks,
+    asinh,
     joined,
     numbered,
     pressure_blocks,
@@ -229,12 +230,12 @@ class Follow:
         errors = [self.target_mm(state, ahead) - point for ahead in range(self.config.preview + 1)]
         blocks = {
             SHAPE: (part.steered_mm - self._rest)[:, 1:].flatten(1) / 10.0,
-            **numbered(ERROR, [error.asinh() for error in errors]),
-            **numbered(FINE, [(error / self.config.fine_mm).asinh() for error in errors[:2]]),
+            **numbered(ERROR, [asinh(error) for error in errors]),
+            **numbered(FINE, [asinh(error / self.config.fine_mm) for error in errors[:2]]),
         }
         if self.config.one_step_prediction:
             predicted = self.target_mm(state, 1) - self.marker(self._held(part))
-            blocks[PREDICTED] = (predicted / self.config.fine_mm).asinh()
+            blocks[PREDICTED] = asinh(predicted / self.config.fine_mm)
         blocks |= pressure_blocks(self.arm, part)
         blocks[PRESSURE_HISTORY] = history.kPa.flatten(1)
         blocks[POINT_HISTORY] = history.mm.flatten(1)

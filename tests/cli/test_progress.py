@@ -1,6 +1,8 @@
 """Rate, rest and end of work: against clocks and rates given by hand."""
 
+import io
 import re
+import sys
 from datetime import datetime
 
 import surgisoft.cli.progress as under_test
@@ -69,3 +71,26 @@ def test_without_a_terminal_occasional_lines_state_the_time_left(capsys, monkeyp
         r"surgisoft: evaluate scripted: 67%, playing, \S+ %/s, \d+ s left, ends \d\d:\d\d", lines[2]
     )
     assert lines[3] == "surgisoft: evaluate scripted: 100%, playing"
+
+
+class Terminal(io.StringIO):
+    """Keeps what is written to a terminal."""
+
+    def isatty(self):
+        return True
+
+
+def test_a_cell_of_a_notebook_gets_no_bar(monkeypatch):
+    """IPython runs `!command` in a pseudo-terminal, whose every redrawn bar stays in the output."""
+    shown = {}
+    for started_by in ("shell", "notebook"):
+        monkeypatch.delenv(under_test.NOTEBOOK, raising=False)
+        if started_by == "notebook":
+            monkeypatch.setenv(under_test.NOTEBOOK, "1234")
+        monkeypatch.setenv("TERM", "xterm")
+        monkeypatch.setattr(sys, "stderr", Terminal())
+        with progress("fit") as report:
+            report(1, 2, "half of it")
+        shown[started_by] = sys.stderr.getvalue()
+    assert "half of it" in shown["shell"]
+    assert shown["notebook"] == ""

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from surgisoft.diagnosis.candidates import with_effect
+from surgisoft.diagnosis.estimation import network_error
 from surgisoft.diagnosis.estimation.effects import fit_effects
 from surgisoft.diagnosis.estimation.least_squares import (
     Prediction,
@@ -16,7 +17,8 @@ from surgisoft.diagnosis.estimation.least_squares import (
     vector,
 )
 from surgisoft.diagnosis.estimation.network import retune
-from surgisoft.diagnosis.estimation.nuisance import kinds
+from surgisoft.diagnosis.estimation.network_error import NetworkError
+from surgisoft.diagnosis.estimation.nuisance import Nuisance, kinds
 from surgisoft.diagnosis.residuals import problem_of
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import history_of
@@ -104,10 +106,11 @@ def test_parameters_come_back_and_the_error_falls_to_the_noise(name):
 
 
 def test_intervals_shrink_with_the_data():
-    """Four times the rows, half the width (within sampling error)."""
+    """Four times the rows, half the width (within sampling error), where the network is exact."""
     truth, widths = TRUTHS["gain_mismatch"], []
     for rows in (150, 600):
         problem = problem_of(bare_arm(), [measured_on(truth, rows=rows)], part="training")
+        problem = replace(problem, discrepancy_mm=np.full(5, 1e-3))
         (parameter,) = fit_effects(problem, ["gain_mismatch"]).parameters
         widths.append(np.mean(np.subtract(parameter.high, parameter.low)))
     assert 0.25 < widths[1] / widths[0] < 0.9
@@ -229,6 +232,63 @@ def test_an_interval_contains_the_error_of_the_network():
         (parameter,) = fit_effects(problem, ["gain_mismatch"]).parameters
         widths.append(np.mean(np.subtract(parameter.high, parameter.low)))
     assert widths[1] > 3 * widths[0]
+
+
+def short_problem():
+    """An arm of two hundred rows in ten blocks of time."""
+    problem = problem_of(bare_arm(), [measured_on(bare_arm(), runs=2, rows=100)], part="all")
+    return replace(problem, discrepancy_mm=np.full(5, 0.2))
+
+
+def test_a_network_errs_as_with_other_weights_at_its_validated_size(monkeypatch):
+    """Networks whose weights are moved at random pull as much at two fields as the prior says."""
+    problem, rng = short_problem(), np.random.default_rng(0)
+    prior, network = NetworkError.of(problem), problem.model.network
+    fields = np.ones((200, 5, 3, 2))
+    fields[..., 1] = problem.pressure[:, :1, None]
+    span, drawn, squares = np.array(problem.model.spec.span), [], []
+    for _ in range(80):
+        other = copy.deepcopy(network)
+        for layer in other.layers[::2]:
+            size = 1e-3 * float(layer.weight.std())
+            for each in (layer.weight, layer.bias):
+                each.data += size * torch.from_numpy(rng.normal(size=each.shape)).float()
+        away = rng.uniform(0, 1, (100, 3)) * span, rng.choice([-1.0, 1.0], (100, 3))
+        at = problem.table.pressure, problem.direction
+        errors = []
+        for each in (at, away):
+            inputs = [torch.from_numpy(values).float() for values in each]
+            errors.append((other(*inputs) - network(*inputs)).detach().double().numpy() / 1e-3)
+        drawn.append(np.einsum("sncp,snc->p", fields, errors[0]))
+        squares.append(np.square(errors[1]).sum(-1).mean())
+    expected = np.cov(np.array(drawn).T) * 0.2**2 / np.mean(squares)
+    for most in (2, 1):
+        monkeypatch.setattr(network_error, "MOST_BACKWARD", most)
+        pulls = prior.pulls(fields)
+        found = pulls @ pulls.T
+        np.testing.assert_allclose(np.diag(found), np.diag(expected), rtol=0.5)
+        one, two = (each[0, 1] / np.sqrt(np.diag(each).prod()) for each in (found, expected))
+        assert one == pytest.approx(two, abs=0.25)
+
+
+def test_a_block_is_judged_by_the_static_error_of_the_others():
+    """The short cut equals a fit without the block's rows, for key points that are missing, too."""
+    problem, rng = short_problem(), np.random.default_rng(1)
+    residual = rng.normal(size=problem.residual.shape)
+    residual[::7, 2] = np.nan
+    nuisance = Nuisance.of(problem, residual)
+    found = nuisance.held_out(residual, problem.block)
+    features = nuisance.features
+    for block, point in ((0, 0), (3, 2)):
+        seen = nuisance.seen[:, point]
+        others, own = seen & (problem.block != block), seen & (problem.block == block)
+        factor = np.triu(nuisance.factors[point][0])
+        ridge = factor.T @ factor - features[seen].T @ features[seen]
+        normal = features[others].T @ features[others] + ridge
+        weights = np.linalg.solve(normal, features[others].T @ residual[others, point])
+        expected = residual[own, point] - features[own] @ weights
+        np.testing.assert_allclose(found[own, point], expected, rtol=1e-6, atol=1e-8)
+    assert not found[::7, 2].any()
 
 
 def test_amplitudes_of_an_effect_that_is_not_there_are_no_surprise():

@@ -5,7 +5,14 @@ import pytest
 from scipy.signal import lfilter
 
 from surgisoft.errors import InputError
-from surgisoft.live.change import AlarmDesign, Charts, Stretch, block_means, blocks_of
+from surgisoft.live.change import (
+    AlarmDesign,
+    Charts,
+    Coverage,
+    Stretch,
+    block_means,
+    blocks_of,
+)
 from surgisoft.live.change import fit_detector as fit
 
 RATE_HZ = 20.0
@@ -51,8 +58,8 @@ def detector():
 
 
 def test_the_threshold_follows_from_the_wanted_rate(detector):
-    """Lorden (1971): exp(h) blocks of each of two charts for each of nine components."""
-    assert detector.threshold == pytest.approx(np.log(10 * 3600 / 0.5 * 2 * 9))
+    """Lorden (1971): exp(h) blocks of each of three charts for each of nine components."""
+    assert detector.threshold == pytest.approx(np.log(10 * 3600 / 0.5 * 3 * 9))
     other = fit_detector([residual(600, 1)], AlarmDesign(false_alarm_h=1.0))
     assert detector.threshold - other.threshold == pytest.approx(np.log(10.0))
 
@@ -118,16 +125,18 @@ def test_sample_by_sample_is_the_cusum_of_the_block_means(detector):
     assert not w.elsewhere_mm2.any()
     assert unknown[1:].max() < 0.2, "the waves return to where the reference was"
     y = left @ w.axes
-    charts, expected = np.zeros(18), []
+    charts, expected, last = np.zeros(27), [], [np.zeros(27)]
     for now, before, step in zip(y[1:], y[:-1], np.diff(blocks.position, axis=0), strict=True):
         kept = np.exp(-np.hypot(*step) / w.memory.reach - 0.5 / w.memory.time_s)
         rho = (1 - w.memory.white) * kept
         sd = w.level_mm * detector.enlargement
         level, fast = (now / sd) ** 2, (now - rho * before) ** 2 / sd**2 / (1 - rho**2)
-        ratio = 0.5 * np.concatenate([level, fast]) * (1 - design.scale**-2) - np.log(design.scale)
-        ratio[:9] *= (1 - kept**2) / (1 + kept**2)
-        most = np.concatenate([(1 - kept**2) / (1 + kept**2), np.ones(9)]) * h / 3
-        charts = np.maximum(0.0, charts + np.minimum(np.minimum(ratio, h / 4), most))
+        squares, worth = np.concatenate([level, fast, fast]), (1 - kept**2) / (1 + kept**2)
+        count = np.concatenate([worth, np.ones(9), worth >= 0.5])
+        ratio = (0.5 * squares * (1 - design.scale**-2) - np.log(design.scale)) * count
+        charts = np.maximum(0.0, charts + np.minimum(np.minimum(ratio, h / 4), count * h / 3))
+        charts = np.minimum(charts, np.min(last[-6:], axis=0) + h / 2)
+        last.append(charts)
         expected.append(charts.max() / h)
     np.testing.assert_allclose(levels[20::10][: len(expected)], expected[: len(levels[20::10])])
 
@@ -198,3 +207,39 @@ def test_motion_that_the_reference_lacks_is_not_judged(detector):
             charts.update(*each)
         assert len(charts.alarms) == alarms
         assert charts.left_out in ((80, 81) if alarms == 0 else (0,))
+
+
+def test_one_move_alone_raises_no_alarm_and_a_lasting_error_does(detector):
+    """Two seconds of an error of 5 mm are one event; eight seconds of it are not."""
+    for seconds, alarms in ((2.0, 0), (8.0, 1)):
+        t_s, values = residual(120, 6)
+        values[(t_s >= 60.0) & (t_s < 60.0 + seconds), -1] += 5.0
+        charts, levels = fed(detector, t_s, values)
+        assert len(charts.alarms) == alarms
+        assert levels.max() > 0.45
+
+
+def test_a_reference_that_does_not_repeat_judges_nothing():
+    """Straight through the range in four minutes, never coming back; then a lasting error."""
+    t_s, values = residual(240, 3)
+    away = SPAN * np.linspace(0.0, 1.0, len(t_s))[:, None]
+    found = fit([Stretch(t_s, values, away)], SPAN)
+    assert found.repeated < 0.5
+    assert not found.judges
+    values[t_s >= 120.0, -1] += 1.0
+    charts = Charts(found)
+    for each in zip(t_s, values, away, strict=True):
+        charts.update(*each)
+    assert not charts.alarms
+    assert not charts.judged
+
+
+def test_a_motion_is_covered_where_the_reference_came_to_it_twice():
+    there, here = np.full((8, 2), -1.0), np.full((8, 2), 1.0)
+    asked = np.array([1.0, 1.0, 0.0, 0.0])
+    assert Coverage.of([np.concatenate([there, here])], 0.5).visits(asked) == 1
+    twice = Coverage.of([np.concatenate([there, here, there, here])], 0.5)
+    assert twice.visits(asked) == 2
+    assert twice.covers(asked)
+    assert not twice.covers(-0.5 * asked)
+    assert Coverage.of([here, here], 0.5).visits(asked) == 2, "another run is another visit"

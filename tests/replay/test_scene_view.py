@@ -18,6 +18,7 @@ from surgisoft.replay.show import open_replay
 from surgisoft.replay.viewer import free_port, serve_viewer, take_screenshot, web_address
 from surgisoft.scene.folder import open_scene
 from surgisoft.scene.mesh import Mesh
+from tests.replay.reading import column
 
 PHANTOM = Path(__file__).resolve().parents[2] / "scenes" / "phantom_liver"
 
@@ -78,6 +79,16 @@ def recording(tmp_path_factory):
     path = tmp_path_factory.mktemp("view") / "scene.rrd"
     assert run(["scene", "show", str(PHANTOM), "--save", str(path)]) == 0
     return path
+
+
+def test_the_legend_names_what_is_there_and_the_bar_has_its_length(recording):
+    (text,) = column(recording, "/legend", "TextDocument:text")[-1]
+    for words in ("phantom_liver", "red-brown**: organ: liver", "yellow**: the ring of 20 mm"):
+        assert words in text
+    assert "tip" not in text, "no arm has none of the other tools"
+    (label,) = column(recording, "/scale_bar", "LineStrips3D:labels")[-1]
+    ((start, end),) = column(recording, "/scale_bar", "LineStrips3D:strips")[-1]
+    assert label == f"{np.linalg.norm(np.subtract(end, start)):g} mm"
 
 
 def test_the_recording_holds_the_whole_scene(recording):

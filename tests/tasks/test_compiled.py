@@ -1,5 +1,6 @@
 """The compiled world against the reference in tensor operations, over whole episodes."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -8,6 +9,7 @@ import torch
 from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.camera import seen_from
 from surgisoft.tasks.base import Episodes
+from surgisoft.tasks.observations import OBSERVATION_LIMIT, asinh
 from surgisoft.tasks.registry import TASKS, make_task
 from surgisoft.tasks.world.scene import ENDOSCOPE, SceneEngine
 
@@ -93,3 +95,13 @@ def test_lines_of_sight_are_hidden_where_a_ray_meets_something():
     assert 0 < views[1].hidden.sum() < views[1].visible.sum()
     for field in ("visible", "hidden", "fraction"):
         assert torch.equal(getattr(views[0], field), getattr(views[1], field)), field
+
+
+def test_asinh_of_observations_keeps_its_digits():
+    size = torch.logspace(-30, 17, 2001)
+    x = torch.cat([size, -size, torch.tensor([0.0, math.inf, -math.inf, math.nan])])
+    found, truth = asinh(x)[:-1], x.double()[:-1].asinh()
+    known = truth.isfinite()
+    assert torch.allclose(found[known].double(), truth[known], rtol=2e-7, atol=0.0)
+    assert (found[~known].abs() > OBSERVATION_LIMIT).all()
+    assert asinh(x)[-1].isnan()

@@ -24,6 +24,7 @@ from surgisoft.diagnosis.estimation.least_squares import (
     free_parameters,
     repeated_scan,
 )
+from surgisoft.diagnosis.estimation.network_error import NetworkError
 from surgisoft.diagnosis.residuals import Problem
 from surgisoft.errors import InputError
 from surgisoft.surrogate.effects import Effect
@@ -83,16 +84,14 @@ def fit_effects(problem: Problem, names: list[str]) -> Fitted:
             fits[name,] = fit_amplitudes(model, problem, name)
         if small:
             fits[tuple(small)] = fit_all(model, problem, small)
-    parameters, chance = [], None
+    parameters, chance, network = [], None, NetworkError.of(problem)
     for keys, fit in fits.items():
         effects = {key: model.effects[key] for key in keys}
         free = free_parameters(model, keys)
         if len(keys) == 1 and keys[0] in large:
             free = {f"{keys[0]}.{k}": p for k, p in effects[keys[0]].amplitudes().items()}
-        known = with_covariance(fit, problem)
-        parameters += intervals(
-            effects, free, known, [with_covariance(each, problem) for each in others]
-        )
+        known, *ends = (with_covariance(each, problem, network) for each in (fit, *others))
+        parameters += intervals(effects, free, known, ends)
         new = _are_new_amplitudes(model, keys, refitted)
         if not large and new.any():
             chance = p_value(known, new)
@@ -149,7 +148,8 @@ def fit_plausible(problem: Problem, fitted: Fitted, names: list[str], name: str)
         return None
     effects = {key: model.effects[key] for key in small}
     free = free_parameters(model, small, held=name)
-    found = intervals(effects, free, with_covariance(fit, problem))
+    known = with_covariance(fit, problem, NetworkError.of(problem))
+    found = intervals(effects, free, known)
     rest = [p for p in fitted.parameters if p.effect not in small]
     order = {each: position for position, each in enumerate(names)}
     parameters = sorted([*found, *rest], key=lambda parameter: order[parameter.effect])

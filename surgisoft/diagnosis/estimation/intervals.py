@@ -3,12 +3,16 @@
 The values v of a fit err by H^-1 (e_1 + e_2 + e_3), with H the curvature of the misfit and
 
 - e_1 the noise, and all else that neighbouring rows share: rows of one block of time err together,
-  so blocks are the samples, and its covariance is the sandwich of Liang & Zeger (1986, eq. 7);
-- e_2 the network's own error (model discrepancy, Kennedy & O'Hagan 2001), a function of actuation
-  and direction that resembles the effect a little. A recording shows one such function, however
-  long it is, so its blocks do not tell by how much it moves the values. Its covariance under the
-  prior of `discrepancy`, at the validated size, is J' W K W J: features F with unit-normal weights,
-  K = F F' times the covariance along the body;
+  so blocks are the samples (Liang & Zeger 1986, eq. 7). A block's residual is taken less the model
+  discrepancy that the *other* blocks give (cluster jackknife: MacKinnon & White 1985; Bell &
+  McCaffrey 2002). Less its own fit it would be too small, and with the discrepancy left in it the
+  network's error would count here and again in e_2;
+- e_2 the network's own error (model discrepancy, Kennedy & O'Hagan 2001), which resembles the
+  effect a little. A recording shows one such error, however long it is, so its blocks do not tell
+  by how much it moves the values. Its covariance is that of `network_error`, at the validated size
+  or, where it is larger, at that of what the fit leaves. For a model without a network it is that
+  of the random function of `discrepancy`, J' W K W J with K = F F' times the covariance along the
+  body;
 - e_3 what holds values near their start where the rows say little: the spread of that prior.
 
 Draws from that covariance go through `Effect.quantities`. With B blocks the first part is widened
@@ -26,17 +30,14 @@ from scipy.special import chdtrc, ndtri, stdtrit
 from torch import Tensor
 
 from surgisoft.diagnosis.discrepancy import body_covariance
-from surgisoft.diagnosis.estimation.least_squares import Fit, block_slopes, set_vector
+from surgisoft.diagnosis.estimation.least_squares import Fit, set_vector
+from surgisoft.diagnosis.estimation.network_error import NetworkError
 from surgisoft.diagnosis.residuals import Problem
+from surgisoft.diagnosis.statistics import block_sums
 from surgisoft.surrogate.effects import Effect
 
 DRAWS = 400
 """Draws of the values."""
-ROOM = 1.5
-"""Factor on the model discrepancy's size: the error of a network is smoother than a random function
-of its size and resembles effects more. The least of 1, 1.25, 1.5, 1.75 and 2 with which at least
-95 % of the intervals held on the robots 201 to 204 (`surgisoft benchmark intervals --robots
-201,202,203,204 --count 12`); other robots are reported."""
 MOST_VALUES = 9
 """Most values of one quantity that are written out."""
 
@@ -122,21 +123,43 @@ class Fitted:
         return self.fit.values + rng.standard_normal((number, len(values))) @ spread.T
 
 
-def with_covariance(fit: Fit, problem: Problem) -> Fitted:
-    """A fit to a problem's rows with the covariance of its values."""
-    grams, slopes = block_slopes(fit, problem.block)
-    blocks = len(grams)
+def with_covariance(fit: Fit, problem: Problem, network: NetworkError | None) -> Fitted:
+    """A fit to a problem's rows with the covariance of its values.
+
+    network: prior of the error of the model's network, None where it has none.
+    """
+    weighted = fit.nuisance.weighted(fit.jacobian)
+    count = weighted.shape[-1]
+    held_out = fit.nuisance.held_out(fit.residual, problem.block)
+    slopes = block_sums((weighted * held_out[..., None]).sum((1, 2)), problem.block)
+    blocks = len(slopes)
     centred = slopes - slopes.mean(0)
     wider = stdtrit(blocks - 1, 0.975) / ndtri(0.975)
     meat = centred.T @ centred * wider**2 * blocks / (blocks - 1)
-    # (n, 3, F, P) how each feature of the discrepancy pulls at the values.
-    pull = np.einsum("sf,sncp->ncfp", fit.nuisance.features, fit.nuisance.weighted(fit.jacobian))
-    body = ROOM**2 * body_covariance(problem.discrepancy_mm)
-    meat += np.einsum("kcfp,kl,lcfq->pq", pull, body, pull, optimize=True)
+    larger = _beyond_tolerance(fit, problem)
+    if network is not None:
+        pulls = network.pulls(weighted)
+        meat += larger * (pulls @ pulls.T)
+    else:
+        # (n, 3, F, P) how each feature of the discrepancy pulls at the values.
+        pull = np.einsum("sf,sncp->ncfp", fit.nuisance.features, weighted, optimize=True)
+        body = body_covariance(problem.discrepancy_mm)
+        meat += larger * np.einsum("kcfp,kl,lcfq->pq", pull, body, pull, optimize=True)
     meat += fit.hold @ (fit.prior_variance[:, None] * fit.hold)
-    curvature = grams.sum(0) + fit.hold
-    curvature += 1e-9 * np.diag(curvature).max() * np.eye(len(curvature))
+    curvature = weighted.reshape(-1, count).T @ fit.jacobian.reshape(-1, count)
+    curvature = (curvature + curvature.T) / 2 + fit.hold
+    curvature += 1e-9 * np.diag(curvature).max() * np.eye(count)
     return Fitted(fit, curvature, meat)
+
+
+def _beyond_tolerance(fit: Fit, problem: Problem) -> float:
+    """Mean square that a fit leaves, noise taken off, over that which the right effect may leave.
+
+    At least 1. A network that is off by more than it was validated to be errs by as much in the
+    direction of the effect, too.
+    """
+    left = np.nanmean(np.square(fit.residual).sum(-1)) - np.mean(problem.noise_mm**2)
+    return max(1.0, float(left / np.mean(problem.tolerance_mm**2)))
 
 
 def p_value(fitted: Fitted, amplitudes: np.ndarray) -> float:

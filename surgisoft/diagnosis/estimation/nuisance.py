@@ -70,6 +70,26 @@ class Nuisance:
             answer[:, k] = flat.reshape(field[:, k].shape)
         return answer
 
+    def held_out(self, residual: np.ndarray, block: np.ndarray) -> np.ndarray:
+        """(S, n, 3) residual (S, n, 3) of each block less the static error by all other blocks.
+
+        block: (S,) block of each row. What the fit to all rows leaves, W r, follows the block's own
+        rows; without them it is (W_bb)^-1 (W r)_b (leave-one-out residuals; Cook & Weisberg 1982,
+        sec. 2.2). Zero where nothing was measured.
+        """
+        answer = self.weighted(residual)
+        for k, (factor, lower) in enumerate(self.factors):
+            mask = self.seen[:, k]
+            triangle = factor if lower else factor.T
+            half = linalg.solve_triangular(
+                triangle, self.features.T, lower=True, check_finite=False
+            )
+            for number in np.unique(block):
+                rows = np.flatnonzero((block == number) & mask)
+                own = np.eye(len(rows)) - half[:, rows].T @ half[:, rows]
+                answer[rows, k] = linalg.solve(own, answer[rows, k], assume_a="pos")
+        return answer
+
     def misfit(self, residual: np.ndarray) -> float:
         """r' W r of a residual (S, n, 3): its sum of squares without the static error, mm^2."""
         return float(

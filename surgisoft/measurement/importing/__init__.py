@@ -6,6 +6,7 @@ from surgisoft.measurement.importing.convert import (
     import_lerobot,
     import_log,
 )
+from surgisoft.measurement.importing.draft import draft_map
 from surgisoft.measurement.importing.raw import RawTable, Reader
 from surgisoft.measurement.importing.readers import READERS
 from surgisoft.measurement.importing.ready_maps import READY_MAPS
@@ -18,6 +19,7 @@ __all__ = [
     "Imported",
     "RawTable",
     "Reader",
+    "draft_map",
     "import_files",
     "import_lerobot",
     "import_log",

@@ -330,7 +330,7 @@ def _explained(
 ) -> bool:
     """Whether a step of this share of the motion comes with a move of the actuation in the second
     before, and with steps of the other key points where there are any."""
-    if others and max(other.ratio_near(row) for other in others) <= JUMP_RATIO / 2:
+    if others and not any(other.ratio_near(row) > JUMP_RATIO / 2 for other in others):
         return False
     early = np.searchsorted(recording.t_s[run], recording.t_s[row] - 1.0) + run.start
     rows = slice(int(max(run.start, min(early, row - 5))), row + 1)

@@ -287,8 +287,8 @@ def fed(part: ArmPart, move_mm: Tensor) -> ArmPart:
 
 
 def _not_finite(parts: Mapping[str, ArmPart]) -> Tensor:
-    """(B,) bool: some key point is not finite."""
-    finite = [part.points_mm.isfinite().flatten(1).all(1) for part in parts.values()]
+    """(B,) bool: some key point is not finite, or so far away that their sum is not."""
+    finite = [part.points_mm.flatten(1).sum(1).isfinite() for part in parts.values()]
     return ~torch.stack(finite).all(0)
 
 

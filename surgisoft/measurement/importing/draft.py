@@ -1,0 +1,239 @@
+"""A draft of a map file from the header of a laboratory's text file.
+
+Only the names of the columns are read, and of the numbers their separator and decimal sign. What a
+name does not say (a unit, the frame) is marked for the person who checks the draft.
+"""
+
+import json
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from surgisoft.errors import InputError
+from surgisoft.measurement.recordings.columns import MM_PER
+from surgisoft.measurement.tables import read_text
+from surgisoft.measurement.units import ACTUATION_UNITS, SECONDS_PER
+
+SEPARATORS = (";", "\t", ",", "whitespace")
+"""Separators that are tried; the one that gives the most columns of numbers is taken."""
+LOOKED_AT = 400
+"""Most lines in which the first row of numbers is looked for (a count)."""
+NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?|nan|n/a|", re.I)
+TIME = re.compile(r"t|time.*|zeit.*|(time)?stamps?|elapsed.*|clock|sec(onds)?", re.I)
+COMMAND = re.compile(r"cmd|command|soll|set ?point|desired|reference|(^|_)[cu]_?\d", re.I)
+ACTUATION = re.compile(
+    r"press|druck|pneu|valve|ventil|motor|servo|tendon|cable|chamber|kammer|bellow|actuat|(^|_)p_?\w$",
+    re.I,
+)
+NOT_MEASURED = re.compile(r"target|goal|soll|reference|desired|predict|\bvel|\bacc", re.I)
+"""Words in the names of positions that are no measured ones."""
+RUN = re.compile(r"(run|take|trial|episode|repeat)([_ ]?(id|nr|no|number|index))?", re.I)
+AN_X = re.compile(r"(?<![A-Za-z])[xX](?![A-Za-z])|(?<=[a-z0-9])X(?![a-z])")
+"""An x that stands for the axis: `x0`, `tip_x`, `tipX`."""
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """How a text file is laid out."""
+
+    separator: str
+    decimal: str
+    names: tuple[str, ...]
+    """Names of the columns."""
+    skip_rows: int
+    """Lines before the header, or before the numbers where the header is not read."""
+    header: bool
+    """Whether the line before the numbers is the header."""
+
+
+def draft_map(path: str | Path) -> str:
+    """The text of a map for a laboratory's text file, to be checked by a person.
+
+    Raises InputError for a file without rows of numbers, and where no columns of key points are
+    recognised.
+    """
+    path = Path(path)
+    layout = _layout(path)
+    names = layout.names
+    points = _key_points(names)
+    if not points:
+        shown = ", ".join(name for name in names[:12] if name)
+        raise InputError(
+            f"{path}: no columns x, y, z of key points are recognised among {shown or 'unnamed'}; "
+            "write the map by hand, docs/recordings.md has one to start from"
+        )
+    used = {name for point in points for name in point}
+    time = next((n for n in names if TIME.fullmatch(_split(n, SECONDS_PER)[0].strip())), None)
+    used |= {time} if time else set()
+    rest = [name for name in names if name and name not in used]
+    commanded = [n for n in rest if COMMAND.search(n) and not NOT_MEASURED.search(n)]
+    commanded += [n for n in rest if re.search("soll", n, re.I) and n not in commanded]
+    measured = [n for n in rest if n not in commanded and _is_actuation(n)]
+    lines = [
+        f"# Draft of a map for {path.name}, from the names of its columns. Check every line:",
+        "# units, the order of the channels, the key points from base to tip, the frame.",
+        "# docs/recordings.md explains all fields.",
+        "",
+        *_file(layout),
+        "[time]",
+    ]
+    column = _columns(layout)
+    if time is None:
+        lines += ["rate_hz = 20.0  # check: no column of time is recognised", ""]
+    else:
+        unit = _unit([time], SECONDS_PER, "s")
+        lines += [f"column = {column([time])[0]}", f"unit = {unit}", ""]
+    for table, found in (("measured", measured), ("commanded", commanded)):
+        if found:
+            unit = _unit(found, ACTUATION_UNITS, "kPa")
+            lines += [f"[{table}]", f"columns = [{', '.join(column(found))}]", f"unit = {unit}"]
+            lines += ['# to = "kPa"  # the unit of your model, if it is another one', ""]
+    if not measured and not commanded:
+        lines += ["# [measured]  # check: no columns of the actuation are recognised", ""]
+    triples = ", ".join(f"[{', '.join(column(point))}]" for point in points)
+    lines += [
+        "[key_points]  # check: from base to tip",
+        f"positions = [{triples}]",
+        f"unit = {_unit([name for point in points for name in point], MM_PER, 'mm')}",
+        "",
+        "# [frame]  # check: the recording's z points along the arm at rest, away from the base",
+        '# rotation = "x z -y"  # our x is your x, our y your z, our z minus your y',
+        '# origin = "k0"',
+        "# gravity = [0, -1, 0]  # direction of weight in your frame",
+    ]
+    runs = next((name for name in rest if RUN.fullmatch(name) and name not in commanded), None)
+    if runs:
+        lines += [
+            "",
+            "[runs]  # check: a new value begins a new run",
+            f"column = {column([runs])[0]}",
+        ]
+    unused = [name for name in rest if name not in (*measured, *commanded, runs)]
+    if unused:
+        lines += ["", f"# not used: {', '.join(unused)}"]
+    return "\n".join(lines) + "\n"
+
+
+def _layout(path: Path) -> _Layout:
+    """The layout with the most columns of numbers."""
+    text = read_text(path).decode("utf-8", errors="replace")
+    lines = text.lstrip("\ufeff").splitlines()[:LOOKED_AT]
+    best, most = None, 1
+    for separator in SEPARATORS:
+        rows = [_cells(line, separator) for line in lines]
+        numbers = [
+            bool(line.strip()) and _numeric(row) for line, row in zip(lines, rows, strict=True)
+        ]
+        first = next((k for k, numeric in enumerate(numbers) if numeric and len(rows[k]) > 1), None)
+        if first is not None and len(rows[first]) > most:
+            best, most = (separator, rows, first), len(rows[first])
+    if best is None:
+        raise InputError(
+            f"{path}: no rows of numbers are recognised, expected a text file of columns; "
+            "docs/recordings.md lists the other formats"
+        )
+    separator, rows, first = best
+    comma = separator != "," and any("," in cell for cell in rows[first])
+    above = [k for k in range(first) if any(cell.strip("# ") for cell in rows[k])]
+    head = above[-1] if above else None
+    units: list[str] = []
+    if len(above) > 1 and _all_units(rows[above[-1]]) and len(rows[above[-2]]) == most:
+        units, head = rows[above[-1]], above[-2]
+    if head is None or len(rows[head]) != most or (head + 1 < first and not units):
+        head = None
+    if head is None:
+        return _Layout(separator, "," if comma else ".", ("",) * most, first, False)
+    names = [name.strip().removeprefix("#").strip().strip('"') for name in rows[head]]
+    if units:
+        names = [f"{name} [{unit.strip('[]() ')}]" for name, unit in zip(names, units, strict=True)]
+    return _Layout(
+        separator, "," if comma else ".", tuple(names), first if units else head, not units
+    )
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    return line.split() if separator == "whitespace" else line.rstrip(separator).split(separator)
+
+
+def _numeric(row: Sequence[str]) -> bool:
+    """Whether most cells are numbers, and not all are empty."""
+    numbers = [NUMBER.fullmatch(cell.strip().strip('"')) is not None for cell in row]
+    return sum(numbers) >= 0.8 * len(row) and any(any(c.isdigit() for c in cell) for cell in row)
+
+
+def _all_units(row: Sequence[str]) -> bool:
+    """Whether a line below the header holds units."""
+    known = {unit.lower() for unit in (*SECONDS_PER, *MM_PER, *ACTUATION_UNITS)}
+    found = [cell.strip().strip('[]()#" ').lower() for cell in row]
+    return any(found) and all(cell in known or cell in ("", "-") for cell in found)
+
+
+def _split(name: str, units: Iterable[str]) -> tuple[str, str]:
+    """A column's name without its unit, and the unit; empty where it names none of `units`."""
+    match = re.fullmatch(r"(.*?)[ _.]*[\[(]([^\])]*)[\])]", name) or re.fullmatch(
+        r"(.*)[ _.]([A-Za-z%]+)", name
+    )
+    if match:
+        for unit in units:
+            if match[2].lower() == unit.lower():
+                return match[1], unit
+    return name, ""
+
+
+def _key_points(names: Sequence[str]) -> list[tuple[str, str, str]]:
+    """Columns x, y, z of each measured point, in the order of the file."""
+    found = []
+    for name in names:
+        stem = _split(name, MM_PER)[0]
+        for match in AN_X.finditer(stem):
+            put = [
+                name[: match.start()]
+                + (axis if match[0] == "x" else axis.upper())
+                + name[match.end() :]
+                for axis in "yz"
+            ]
+            if all(other in names for other in put) and not NOT_MEASURED.search(name):
+                found.append((name, put[0], put[1]))
+                break
+    return found
+
+
+def _is_actuation(name: str) -> bool:
+    stem, unit = _split(name, ACTUATION_UNITS)
+    return bool(unit) or ACTUATION.search(stem) is not None
+
+
+def _unit(names: Sequence[str], units: Iterable[str], otherwise: str) -> str:
+    """The unit of columns as TOML, marked where their names state none, or several."""
+    found = list(dict.fromkeys(unit for name in names if (unit := _split(name, units)[1])))
+    if not found:
+        return f'"{otherwise}"  # check: the header names no unit'
+    more = "" if len(found) == 1 else f"  # check: the header names {', '.join(found)}"
+    return f'"{found[0]}"{more}'
+
+
+def _columns(layout: _Layout):
+    """Function that gives columns as TOML: by name, or by number where names cannot be used."""
+
+    def columns(names: Sequence[str]) -> list[str]:
+        if layout.header and all(layout.names.count(name) == 1 for name in names):
+            return [json.dumps(name, ensure_ascii=False) for name in names]
+        return [str(layout.names.index(name) + 1) for name in names]
+
+    return columns
+
+
+def _file(layout: _Layout) -> list[str]:
+    """The table [file.main] where the layout is not the usual one."""
+    lines = []
+    if layout.separator != ",":
+        lines.append(f"separator = {json.dumps(layout.separator)}")
+    if layout.decimal != ".":
+        lines.append(f'decimal = "{layout.decimal}"')
+    if layout.skip_rows:
+        lines.append(f"skip_rows = {layout.skip_rows}")
+    if not layout.header:
+        named = ", ".join(f"{k} {name}" for k, name in enumerate(layout.names, 1) if name)
+        lines.append(f"header = false{f'  # columns: {named}' if named else ''}")
+    return ["[file.main]", *lines, ""] if lines else []

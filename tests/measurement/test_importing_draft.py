@@ -1,0 +1,93 @@
+"""Drafts of maps from headers: each is used to import the file that it was made from."""
+
+import numpy as np
+import pytest
+
+from surgisoft.cli import run
+from surgisoft.errors import InputError
+from surgisoft.measurement.importing import draft_map, import_files, load_map
+
+ROWS = [[0, 1.5, 2.5, 0, 0, 1, 0.5, 0, 60], [50, 1.75, 2.25, 0, 0, 1, 0.25, 0, 61]] * 6
+"""ms, two pressures, two points."""
+
+
+def lab_file(folder, header, separator=",", comma=False, above=""):
+    path = folder / "lab.csv"
+    lines = [
+        separator.join(f"{k * 50 if c == 0 else v:g}" for c, v in enumerate(row))
+        for k, row in enumerate(ROWS)
+    ]
+    body = "\n".join(lines)
+    path.write_text(f"{above}{header}\n{body.replace('.', ',') if comma else body}\n")
+    return path
+
+
+def imported(path, folder):
+    (folder / "map.toml").write_text(draft_map(path))
+    (part,) = import_files([path], load_map(str(folder / "map.toml")), "lab")
+    return part.recording
+
+
+@pytest.mark.parametrize(
+    ("header", "layout", "pressure", "scale"),
+    [
+        ("time_ms,pA_bar,pB_bar,x0_m,y0_m,z0_m,x1_m,y1_m,z1_m", {}, "bar", 1000.0),
+        (
+            "Zeit [ms];Druck A [kPa];Druck B [kPa];m1.X [cm];m1.Y [cm];m1.Z [cm];"
+            "m2.X [cm];m2.Y [cm];m2.Z [cm]",
+            {"separator": ";", "comma": True, "above": "Versuch 7\n1.2.2026\n"},
+            "kPa",
+            10.0,
+        ),
+        (
+            "t valve1 valve2 base_x base_y base_z tip_x tip_y tip_z\nms psi psi mm mm mm mm mm mm",
+            {"separator": " "},
+            "psi",
+            1.0,
+        ),
+    ],
+    ids=["suffixes", "brackets", "a line of units"],
+)
+def test_a_draft_imports_its_file(tmp_path, header, layout, pressure, scale):
+    found = imported(lab_file(tmp_path, header, **layout), tmp_path)
+    assert found.unit == pressure
+    np.testing.assert_allclose(found.t_s, 0.05 * np.arange(len(ROWS)), atol=1e-12)
+    np.testing.assert_allclose(found.measured, [row[1:3] for row in ROWS])
+    expected = scale * np.array([row[3:] for row in ROWS])
+    np.testing.assert_allclose(found.key_points_mm.reshape(-1, 6), expected)
+
+
+def test_what_a_header_does_not_say_is_marked(tmp_path):
+    header = "take,pressure1,set1,x0,y0,z0,target_x,target_y,target_z"
+    text = draft_map(lab_file(tmp_path, header))
+    assert "rate_hz = 20.0  # check: no column of time" in text
+    assert 'columns = ["pressure1"]\nunit = "kPa"  # check: the header names no unit' in text
+    assert 'positions = [["x0", "y0", "z0"]]\nunit = "mm"  # check' in text
+    assert '[runs]  # check: a new value begins a new run\ncolumn = "take"' in text
+    assert "# not used: set1, target_x, target_y, target_z" in text
+
+
+def test_no_key_points_and_no_numbers_are_errors(tmp_path):
+    with pytest.raises(InputError, match=r"no columns x, y, z .* among a, b, c"):
+        draft_map(lab_file(tmp_path, "a,b,c,d,e,f,g,h,i"))
+    (tmp_path / "notes.txt").write_text("no numbers here\nnor here\n")
+    with pytest.raises(InputError, match="no rows of numbers"):
+        draft_map(tmp_path / "notes.txt")
+
+
+def test_the_command_writes_it_and_names_the_next_one(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    lab_file(tmp_path, "time_ms,pA_bar,pB_bar,x0_m,y0_m,z0_m,x1_m,y1_m,z1_m")
+
+    def said(line, code):
+        assert run(line.split()) == code
+        out, err = capsys.readouterr()
+        return out or err
+
+    draft = "import lab.csv --draft map.toml"
+    assert f"'surgisoft {draft}' writes one" in said("import lab.csv -o rec.csv", 2)
+    after = "import lab.csv --map map.toml -o REC.parquet --dry-run"
+    assert f"next: surgisoft {after}" in said(draft, 0)
+    assert "would write REC.parquet" in said(after, 0)
+    assert "exists already" in said(draft, 2)
+    assert "-o is missing" in said("import lab.csv", 2)

@@ -259,9 +259,9 @@ def _results(path: Path) -> None:
     if not (path / "experiment.toml").is_file():
         raise FileNotFoundError(path)
     load_experiment(path / "experiment.toml")
-    for row in (path / "rows").glob("*.json"):
+    for row in (path / "rows").glob("[!.]*.json"):
         read_json(row)
-    for log in (path / "logs").glob("*.npz"):
+    for log in (path / "logs").glob("[!.]*.npz"):
         load_episode(log)
 
 

@@ -105,12 +105,17 @@ def write_onnx(
 
 
 def largest_difference(
-    module: Call, other: Call, cases: Iterable[Sequence[Tensor]], states: int = 0
+    module: Call,
+    other: Call,
+    cases: Iterable[Sequence[Tensor]],
+    states: int = 0,
+    compared_states: bool = True,
 ) -> float:
     """Largest difference of any output over cases; infinite where one is not a number.
 
     states: so many of the first outputs are the first inputs of the next case, in either function,
-    so that errors may add up over a sequence of cases.
+    so that errors may add up over a sequence of cases. compared_states: whether they count
+    themselves, too, and not only by what follows from them.
     """
     worst, mine, theirs = 0.0, None, None
     with torch.no_grad():
@@ -118,7 +123,8 @@ def largest_difference(
             ours = case if mine is None else (*mine[:states], *case[states:])
             others = case if theirs is None else (*theirs[:states], *case[states:])
             mine, theirs = _tuple(module(*ours)), _tuple(other(*others))
-            for a, b in zip(mine, theirs, strict=True):
+            first = 0 if compared_states else states
+            for a, b in zip(mine[first:], theirs[first:], strict=True):
                 gap = (a - b).abs()
                 gap = torch.where(a.isnan() & b.isnan(), 0.0, gap)
                 largest = float(gap.max()) if gap.numel() else 0.0

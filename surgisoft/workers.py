@@ -10,11 +10,14 @@ import ctypes
 import multiprocessing
 import multiprocessing.connection
 import os
+import pickle
 import signal
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from surgisoft.errors import InputError
@@ -32,11 +35,12 @@ ANSWERS_S = 15.0
 """Time within which the scheduler of a cluster has to answer, s."""
 
 
-def begin_worker(prepare: Callable[[], object] | None = None) -> None:
+def begin_worker(prepared: Path | None = None) -> None:
     """Initialise a worker: one thread, no reaction to Ctrl-C, and end with the parent process.
 
     The worker also ends when the parent is killed: the system then closes the pipe that is waited
-    for. prepare: called in the new process, which begins without the state of its parent.
+    for. prepared: file with the pickled function that is called in the new process, which begins
+    without the state of its parent.
     """
     import torch
 
@@ -52,8 +56,8 @@ def begin_worker(prepare: Callable[[], object] | None = None) -> None:
         os._exit(1)
 
     threading.Thread(target=end_with_parent, daemon=True).start()
-    if prepare is not None:
-        prepare()
+    if prepared is not None:
+        pickle.loads(prepared.read_bytes())()
 
 
 @contextlib.contextmanager
@@ -101,6 +105,9 @@ def workers(
 ) -> Iterator[Executor]:
     """Pool of worker processes; an error in the block cancels the work that waits.
 
+    A script that calls this needs `if __name__ == "__main__":`, since each new process imports it.
+    Without, the processes end with Python's advice on that, and the pool with BrokenProcessPool.
+
     processes: their number on this machine. prepare: called once in each new process. cluster:
     address of a Dask scheduler whose workers take the place of processes on this machine; default:
     that of the environment variable `CLUSTER`. Raises InputError where no such cluster answers,
@@ -114,7 +121,12 @@ def workers(
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(processes, context, initializer=begin_worker, initargs=(prepare,))
+    folder = tempfile.TemporaryDirectory(prefix="surgisoft-")
+    # By a file: what goes through the pipe of a process that ends before it reads waits for ever.
+    prepared = Path(folder.name) / "prepare.pickle" if prepare is not None else None
+    if prepared is not None:
+        prepared.write_bytes(pickle.dumps(prepare))
+    pool = ProcessPoolExecutor(processes, context, initializer=begin_worker, initargs=(prepared,))
     try:
         with _held_interrupt():
             pool.submit(os.getpid)  # starts the processes, which inherit what is held
@@ -125,6 +137,7 @@ def workers(
         raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+        folder.cleanup()
         for name, value in before.items():
             if value is None:
                 os.environ.pop(name, None)

@@ -53,6 +53,31 @@ def test_a_killed_process_leaves_no_worker_behind(tmp_path):
     assert not any(alive(pid) for pid in pids)
 
 
+UNGUARDED = """
+from functools import partial
+from surgisoft.workers import workers
+with workers(1, partial(len, bytes(1_000_000))) as pool:
+    print(pool.submit(len, "two").result())
+"""
+
+
+def test_a_script_without_the_guard_of_its_processes_ends_with_advice(tmp_path):
+    """The new process imports the script, which would start another one: it ends at once, before it
+    has read what it is prepared with."""
+    script = tmp_path / "unguarded.py"
+    script.write_text(UNGUARDED)
+    asked = [sys.executable, str(script)]
+    ended = subprocess.run(asked, capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 1
+    assert "if __name__ == '__main__':" in ended.stderr
+    assert "BrokenProcessPool" in ended.stderr
+    script.write_text(
+        UNGUARDED.replace("with workers", "if __name__ == '__main__':\n  with workers")
+    )
+    ended = subprocess.run(asked, capture_output=True, text=True, timeout=60)
+    assert ended.stdout == "3\n", ended.stderr
+
+
 def interrupted() -> None:
     with workers(1) as pool:
         pool.submit(time.sleep, 60)

@@ -70,7 +70,7 @@ def stored_episodes(scenario: Scenario) -> dict[str, EpisodeLog]:
     for text in scenario.states:
         path = Path(text)
         if path.is_dir() and (path / "logs").is_dir():
-            logs = sorted((path / "logs").glob("*.npz"))
+            logs = sorted((path / "logs").glob("[!.]*.npz"))  # hidden: left over by a kill
             if not logs:
                 raise InputError(
                     f"{path}: the results hold no stored episode, expected logs/*.npz; run the "

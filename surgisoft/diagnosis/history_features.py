@@ -22,6 +22,9 @@ RADII = (0.03, 0.1, 0.25, 0.5)
 BLOCK_ROWS = 1 << 16
 """Rows that are followed at once where there are more: what is computed on the way is several times
 larger than what is kept."""
+SINGLE = ("low_pass", "play")
+"""What is kept in single precision of a history of more rows than BLOCK_ROWS: two thirds of a
+memory, 0.5 GB at two million rows. The actuation is in single precision, too."""
 SHORT_S = 0.25
 """Time constant over which a rate is taken, s: shorter, and it shows the sensor's noise."""
 
@@ -63,7 +66,8 @@ def memory_of(history: History, spec: ArmSpec) -> Memory:
         some = torch.arange(first, min(first + wide, runs))
         for name, values in vars(_memory_of(history.select(some), spec)).items():
             if name not in answer:
-                answer[name] = np.empty((int(history.valid.sum()), *values.shape[1:]))
+                kept = np.float32 if name in SINGLE else np.float64
+                answer[name] = np.empty((int(history.valid.sum()), *values.shape[1:]), kept)
             answer[name][begin : begin + len(values)] = values
         begin += len(values)
     return Memory(**answer)

@@ -577,7 +577,7 @@ class _Session:
         if request.observer_gain is not None:
             config = replace(config, observer_gain=request.observer_gain, adapts=False)
         task = on_rig(place, config, lambda config, trial: bench)
-        policy = open_policy(request.policy, task)
+        policy = open_policy(request.policy, place)  # the bench is first moved by the loop
         _rehearse(place, policy)
         return lambda: self._follow_policy(task, policy)
 
@@ -787,6 +787,7 @@ class _Session:
         """Write the recording and what belongs to it."""
         recording = log.finish(self._name) if log.samples else None
         if recording is None:
+            log.discard()
             raise InputError("the run ended before its first sample; nothing was recorded")
         charts = self.charts
         alarms = tuple(charts.alarms) if charts is not None else ()

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import signal
+import threading
 from dataclasses import replace
 
 import pytest
@@ -94,6 +95,35 @@ def test_resumed_is_uninterrupted(run, tmp_path):
     for one, other in zip(*rows, strict=True):
         assert one["reward/arm"] == other["reward/arm"]
         assert one.get("evaluation/error_mm") == other.get("evaluation/error_mm")
+
+
+@pytest.mark.parametrize(("limit", "turns"), [(1e9, 2), (1e-9, 4)])
+def test_training_ends_with_the_evaluation_whose_error_is_low_enough(limit, turns, tmp_path):
+    """`--target-error`; in a thread, as a notebook's, which sets no handlers of signals."""
+    before = signal.getsignal(signal.SIGINT)
+    found = []
+    plan = plan_of(target_error=limit)
+    thread = threading.Thread(
+        target=lambda: found.append(train_new(tmp_path / "run", plan, Processes(), CPU))
+    )
+    thread.start()
+    thread.join()
+    assert found[0].done
+    assert found[0].steps == turns * TINY.envs * TINY.rollout
+    assert RunFolder(tmp_path / "run").load(LAST)["iteration"] == turns
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_second_ctrl_c_ends_training_at_once(tmp_path):
+    before = signal.getsignal(signal.SIGINT)
+
+    def impatient(progress):
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        train_new(tmp_path / "run", plan_of(), Processes(), CPU, impatient)
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_a_kill_between_checkpoints_loses_nothing(run, tmp_path):

@@ -3,8 +3,12 @@
 import numpy as np
 import pytest
 
+from surgisoft.credibility.context import Scenario
 from surgisoft.credibility.domain import States, applicability, percent, rates
 from surgisoft.credibility.retest import Estimate, Repeated, Retest, Told, numbers
+from surgisoft.credibility.scenario import scenario_states, stored_episodes
+from surgisoft.errors import InputError
+from surgisoft.surrogate.checkpoint import default_arm
 
 
 def repeated(*values: float, half: float = 0.1959964) -> Repeated:
@@ -98,3 +102,34 @@ def test_only_what_is_whole_is_100_percent():
         "0.1 %",
         "17.3 %",
     ]
+
+
+def schedule(folder, chambers: int):
+    """A ramp of every chamber from 0 to 10 kPa within 2 s, and a rest of 1 s."""
+    names = ",".join(f"c{k + 1}_kPa" for k in range(chambers))
+    rows = [f"{t}," + ",".join([str(p)] * chambers) for t, p in ((0, 0), (1, 5), (2, 10), (3, 10))]
+    path = folder / f"ramp{chambers}.csv"
+    path.write_text("\n".join([f"t_s,{names}", *rows]) + "\n")
+    return str(path)
+
+
+def test_a_schedule_is_states_with_rates_and_the_loads_in_turn(tmp_path):
+    spec = default_arm().spec
+    (found,) = scenario_states(Scenario((schedule(tmp_path, 3),), (0.0, 50.0)), spec, {})
+    assert found.label == "ramp3"
+    np.testing.assert_allclose(found.pressure[:, 0], [0.0, 5.0, 10.0, 10.0])
+    assert np.abs(found.rate).max() == pytest.approx(5.0)
+    assert found.load_g.tolist() == [0.0, 50.0, 0.0, 50.0]
+    (plain,) = scenario_states(Scenario((schedule(tmp_path, 3),)), spec, {})
+    assert plain.load_g is None
+    with pytest.raises(InputError, match="ramp2 has 2 channels, expected 3 as the model has"):
+        scenario_states(Scenario((schedule(tmp_path, 2),)), spec, {})
+
+
+def test_what_a_killed_experiment_left_behind_is_no_episode(tmp_path):
+    """A file whose writing was killed is hidden; alone it is none, and the message says so."""
+    logs = tmp_path / "results" / "logs"
+    logs.mkdir(parents=True)
+    (logs / ".simulation-0000.0123456789ab.npz").write_bytes(b"PK")
+    with pytest.raises(InputError, match="the results hold no stored episode"):
+        stored_episodes(Scenario((str(tmp_path / "results"),)))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from surgisoft.diagnosis import history_features
 from surgisoft.diagnosis.history_features import RADII, TIMES_S, features, memory_of
 from surgisoft.surrogate.history import pack
 from tests.diagnosis.synthetic import PERIOD_S, backlash, still_model, walk
@@ -13,11 +14,15 @@ from tests.diagnosis.synthetic import PERIOD_S, backlash, still_model, walk
 def two_runs():
     """Two runs of different length; the memory of the second must not know the first."""
     signal = walk(700)
+    return signal, memory_of(_history_of(signal), still_model().spec)
+
+
+def _history_of(signal):
+    """Two runs, of 400 rows and the rest."""
     parts = [signal[:400], signal[400:]]
     times = [PERIOD_S * np.arange(400), 40 + PERIOD_S * np.arange(300)]
     points = [torch.zeros(len(part), 3, 3) for part in parts]
-    history = pack([torch.tensor(t) for t in times], [torch.tensor(p) for p in parts], points)
-    return signal, memory_of(history, still_model().spec)
+    return pack([torch.tensor(t) for t in times], [torch.tensor(p) for p in parts], points)
 
 
 def test_plays_and_largest_start_afresh_in_each_run(two_runs):
@@ -42,6 +47,18 @@ def test_low_passes_agree_with_fine_steps(two_runs):
             fine.append(y)
         assert memory.low_pass[:400, 0, k] == pytest.approx(fine, abs=5e-3)
     assert memory.low_pass[400, :, 0] == pytest.approx(signal[400], abs=1e-5)
+
+
+def test_a_long_history_is_followed_some_runs_at_a_time(two_runs, monkeypatch):
+    """With the same memory, two parts of which are kept in single precision."""
+    signal, whole = two_runs
+    history = _history_of(signal)
+    monkeypatch.setattr(history_features, "BLOCK_ROWS", 400)
+    blocks = memory_of(history, still_model().spec)
+    for name, values in vars(blocks).items():
+        exact = name not in ("low_pass", "play")
+        assert values.dtype == (np.float64 if exact else np.float32), name
+        assert values == pytest.approx(vars(whole)[name], abs=0.0 if exact else 1e-5), name
 
 
 def test_way_since_reversal_and_dwell_by_hand():

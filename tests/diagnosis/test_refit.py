@@ -178,6 +178,8 @@ def test_the_same_seed_gives_the_same_result_and_another_seed_another(problem):
         for seed in (0, 0, 1)
     )
     assert replace(first, seconds=0.0) == replace(again, seconds=0.0)
+    both = refit(problem, together=["line_lag"], config=brief, processes=2)
+    assert replace(both, seconds=0.0) == replace(first, seconds=0.0), "two processes, as one"
     assert first.candidates[0].heldout_rmse_mm != other.candidates[0].heldout_rmse_mm
 
 

@@ -157,6 +157,7 @@ def test_a_scenario_that_is_no_name_is_one_line(tmp_path, value):
         load_experiment(path)
 
 
+LESION = '[[phases]]\nname = "a"\ntimeout_s = 1.0\n[[lesions]]\nname = "b"\ncentre_mm = [0, 0, 0]\n'
 DRIVER = '[[drivers]]\nname = "{name}"\n{what}\n'
 CONTRADICTIONS = {
     "task: got": ("", "task = 1\n"),
@@ -171,8 +172,40 @@ CONTRADICTIONS = {
         DRIVER.format(name="mine", what="waypoints = [[1.0, 1.0, 1.0, 1.0], [1.0, 2.0, 2.0, 2.0]]"),
         "",
     ),
+    "phases: got integer 1; expected a list": ("", "phases = 1\n"),
+    "lesions: contour_ablation treats contours here": (
+        "",
+        'scenario = "contour_ablation"\n[[task.contours]]\nname = "a"\n'
+        "centre_mm = [0.0, 0.0, 0.0]\n" + LESION,
+    ),
     "faults[0].arm: got 'gripper'": (FAULT.replace("endoscope", "gripper"), ""),
 }
+
+
+def test_lesions_belong_to_a_scene(tmp_path):
+    path = write(tmp_path, 'name = "tiny"\nscenario = "track_circle"\n' + LESION)
+    with pytest.raises(InputError, match="lesions: got lesions; expected none: track_circle has"):
+        load_experiment(path)
+
+
+def test_paths_of_a_driver_and_of_an_arm_follow_the_configuration(tmp_path):
+    """The exact configuration lies in the folder of results: its paths are relative to that."""
+    (tmp_path / "push.csv").write_text("t_s,c1_kPa,c2_kPa,c3_kPa\n0,0,0,0\n1,5,0,0\n")
+    (tmp_path / "arm").mkdir()
+    drivers = DRIVER.format(name="push", what='schedule = "push.csv"') + DRIVER.format(
+        name="sweep", what="waypoints = [[0.0, 1.0, 1.0, 1.0], [2.5, 2.0, 2.0, 2.0]]"
+    )
+    case = '[[cases]]\nname = "mine"\narm = "arm"\n'
+    spec = load_experiment(write(tmp_path, TINY + drivers + case))
+    assert spec.drivers[0].schedule == str(tmp_path / "push.csv")
+    assert spec.cases[0].arm == str(tmp_path / "arm")
+    assert [row[0] for row in spec.drivers[1].waypoints] == [0.0, 2.5]
+    (tmp_path / "results").mkdir()
+    save_experiment(spec, tmp_path / "results" / "experiment.toml")
+    text = (tmp_path / "results" / "experiment.toml").read_text()
+    assert 'schedule = "../push.csv"' in text
+    assert 'arm = "../arm"' in text
+    assert load_experiment(tmp_path / "results" / "experiment.toml") == spec
 
 
 @pytest.mark.parametrize("said", CONTRADICTIONS)

@@ -13,11 +13,11 @@ import torch
 import surgisoft
 from surgisoft.cli import run as command
 from surgisoft.errors import InputError
-from surgisoft.live.session import LEAD_IN_S, run
+from surgisoft.live.session import LEAD_IN_S, elsewhere, run
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.recordings import load_recording
 from surgisoft.rig import VirtualRig
-from surgisoft.surrogate.checkpoint import load_model
+from surgisoft.surrogate.checkpoint import default_arm, load_model
 from surgisoft.tasks.path_following import FollowConfig
 from surgisoft.tasks.track import TrackConfig
 from tests.replay.reading import column
@@ -244,6 +244,7 @@ BAD = {
     "rig": (["mixed", "--rig", "nowhere"], "unknown rig 'nowhere'"),
     "before": (["mixed", "--before", "absent.parquet"], "no such file"),
     "window": (["mixed", "--show", "--web"], "at most one"),
+    "schedule": (["mixed", "--task", "track_circle"], "a schedule has no task"),
 }
 
 
@@ -257,6 +258,61 @@ def test_bad_input_is_one_line_and_nothing_is_written(
     assert message in error
     assert error.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"clock": "fast"}, "unknown clock 'fast'"),
+        ({"rig": Real(), "clock": "simulated"}, "is no simulated rig; leave it out"),
+        (
+            {"policy": "scripted", "task": "track_circle", "model": default_arm()},
+            "a policy takes its arm model from a folder; save the model",
+        ),
+        ({"stopped": lambda: True}, "ended before its first sample; nothing was recorded"),
+    ],
+)
+def test_calls_that_make_no_run_write_nothing(schedule, tmp_path, given, message):
+    request = {"policy": schedule, "clock": "simulated", "output": tmp_path / "run.csv"} | given
+    with pytest.raises(InputError, match=message):
+        run(**request)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_trained_policy_brings_its_task_and_rate(tmp_path):
+    """A training of one turn: its task and configuration need no naming, another rate is none."""
+    trained = tmp_path / "trained"
+    surgisoft.train("track_circle", trained, envs=8, steps=64)
+    with pytest.raises(InputError, match="the policy was trained for 10 Hz; leave --rate out"):
+        run(trained, clock="simulated", rate_hz=11.0)
+    with pytest.raises(InputError, match="a task of one arm"):
+        run(trained, task="circle_ablation", clock="simulated")
+    found = run(trained, clock="simulated", minutes=0.2, rate_hz=10.0, observer_gain=0.4)
+    t_s, error = found.tracking.T
+    assert t_s[0] == pytest.approx(4.0, abs=0.11), "the arm rests before the first step"
+    np.testing.assert_allclose(np.diff(t_s), 0.1, atol=1e-9)
+    assert t_s[-1] == pytest.approx(12.0, abs=0.11)
+    assert error[-1] > 1.0, "one turn of training teaches nothing"
+
+
+def test_a_run_in_a_thread_sets_no_handlers(schedule):
+    before, found = signal.getsignal(signal.SIGINT), []
+    run_it = threading.Thread(target=lambda: found.append(run(schedule, minutes=0.05, **SIMULATED)))
+    run_it.start()
+    run_it.join()
+    assert found[0].recording.samples == 60
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_the_known_error_of_a_model_is_its_covariance():
+    """Against the sum of squares by hand; rows with a missing key point count in none."""
+    model = default_arm()
+    known = model.training_residuals
+    rows = [row for row in known.residual_mm.double().numpy().reshape(-1, 15) if (row == row).all()]
+    by_hand = sum(np.outer(row, row) for row in rows) / len(rows)
+    np.testing.assert_allclose(elsewhere(model), by_hand, rtol=1e-9, atol=1e-12)
+    model.training_residuals = None
+    assert elsewhere(model) is None
 
 
 def test_a_rig_with_other_chambers_is_refused(schedule, tmp_path):

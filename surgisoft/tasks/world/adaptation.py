@@ -238,10 +238,14 @@ class DisturbanceEstimator:
         surprise = torch.where(off_mm.isfinite(), off_mm - expected, torch.zeros_like(expected))
         scalar = surprise.flatten(1) @ self.shapes
         across = (memory.covariance * inputs[:, :, None]).sum(3)
-        power = (across * inputs).sum(2) + self.prior.noise_mm**2 / samples
+        noise = self.prior.noise_mm**2 / samples
+        power = (across * inputs).sum(2) + noise
         gain = across / power[..., None]
         mean = memory.mean + gain * scalar[..., None]
         covariance = memory.covariance - gain[..., None] * across[:, :, None]
+        # Joseph's form: 0 but for the rounding, which large motions would let grow.
+        rounding = noise * gain - (covariance * inputs[:, :, None]).sum(3)
+        covariance = covariance + rounding[..., None] * gain[:, :, None]
         terms = mean * inputs
         passing = terms[..., self.steady :].sum(2)
         adopts = self._adopts(mean, covariance)

@@ -78,7 +78,10 @@ def next_experiment(
     check_folder(output.absolute().parent)
     check_free(json_file, "separates")
     if record:
+        from surgisoft.rig.registry import check_rig
+
         check_new_recording(record, force)
+        check_rig(rig)
     check_model(model, predictions)
     measured = read_recordings(recordings) if recordings else []
 
@@ -178,7 +181,13 @@ def _record(result, rig: str, schedule: Path, record: Path, force: bool) -> None
             f"'surgisoft collect {schedule} --rig {rig} -o {record}' (--as-it-stands asks for no "
             "change of the experimental setup)"
         )
-    recording = record_on(schedule, rig, record, force, **setup)
+    try:
+        recording = record_on(schedule, rig, record, force, **setup)
+    except InputError as error:
+        raise InputError(
+            f"{error}. {schedule} is written; to record it: 'surgisoft collect {schedule} --rig "
+            f"{rig} -o {record}'"
+        ) from error
     from surgisoft.measurement.recordings import save_recording
 
     save_recording(recording, record, force)

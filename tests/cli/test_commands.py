@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -320,6 +321,19 @@ def test_next_experiment_records_on_a_simulated_rig_and_asks_a_person_at_a_real_
     said = capsys.readouterr().out
     assert f"on the rig: surgisoft collect {plan} --rig tests.rig.own_rig:OwnRig:port=x" in said
     assert "virtual" not in said
+    for path in (plan, new):
+        path.unlink()
+    for rig, error in (("nothere", "unknown rig 'nothere'"), ("serial:prt=x", "option 'prt'")):
+        assert run([*command, "--rig", rig]) == 2
+        assert error in capsys.readouterr().err
+        assert not plan.exists(), "a rig that cannot be is refused before the search"
+    plain = replace(found, options="")
+    monkeypatch.setattr(designing, "next_experiment", lambda *_, **__: plain)
+    assert run([*command, "--rig", f"serial:port={tmp_path / 'none'},mocap=udp:9763"]) == 2
+    error = capsys.readouterr().err
+    assert "cannot be opened" in error
+    assert f"is written; to record it: 'surgisoft collect {plan} --rig serial" in error
+    assert plan.exists()
 
 
 def test_time_on_the_bench_where_the_clock_begins_anew_with_each_run():

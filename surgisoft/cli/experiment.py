@@ -7,7 +7,7 @@ import typer
 
 from surgisoft.cli import INTERRUPTED, app
 from surgisoft.cli.files import check_folder, show_written
-from surgisoft.cli.inputs import counted, read_context
+from surgisoft.cli.inputs import counted, read_context, warn
 from surgisoft.cli.options import (
     Cluster,
     Credibility,
@@ -86,7 +86,7 @@ def run(
         about = f"surgisoft experiment run {file.name}"
         try:
             results, files = finish_experiment(
-                spec, folder, processes, replays, about, report, cluster
+                spec, folder, processes, replays, about, report, cluster, warn
             )
         except KeyboardInterrupt:
             again = with_effect_files(f"surgisoft experiment run {file} -o {folder} --resume")

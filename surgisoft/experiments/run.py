@@ -7,7 +7,8 @@ one go and one that was interrupted give the same rows.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+import warnings
+from collections.abc import Callable, Iterator
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
@@ -141,11 +142,21 @@ def run_experiment(
     processes: int = 1,
     report: Progress = silent,
     cluster: str | None = None,
+    on_warning: Callable[[str], None] = warnings.warn,
 ) -> list[Row]:
     """Run every block that has no results yet; returns all rows, in order. See `open_results`.
 
     cluster: address of a Dask scheduler whose workers, which see the same folder, run the blocks.
+    on_warning: gets each warning of a block once, whichever process ran the block.
     """
+    warned: set[str] = set()
+
+    def warn(found: list[str]) -> None:
+        for text in found:
+            if text not in warned:
+                warned.add(text)
+                on_warning(text)
+
     every = jobs(spec)
     left = [job for job in every if not _is_done(folder, job)]
     total = float(sum(job.count for job in every))
@@ -159,11 +170,12 @@ def run_experiment(
                 def within(step, steps, note="", job=job, began=began) -> None:
                     report(began + job.count * step / steps, total, job.setting.words)
 
-                _run_block(spec, folder, job, within)
+                warn(_run_block(spec, folder, job, within))
                 done += job.count
                 report(done, total, job.setting.words)
     else:
-        for job in _in_processes(spec, folder.resolve(), left, processes, cluster):
+        for job, found in _in_processes(spec, folder.resolve(), left, processes, cluster):
+            warn(found)
             done += job.count
             report(done, total, job.setting.words)
     return read_rows(folder, every)
@@ -216,32 +228,38 @@ def _is_done(folder: Path, job: Job) -> bool:
     return all(file.is_file() for file in files)
 
 
-def _run_block(spec: Experiment, folder: Path, job: Job, progress: Progress = silent) -> None:
-    """Run a block; its logs are written first, then each episode's row, whole or not at all."""
-    block = roll_out_block(spec, job.setting, job.first, job.count, progress)
+def _run_block(spec: Experiment, folder: Path, job: Job, progress: Progress = silent) -> list[str]:
+    """Run a block; its logs are written first, then each episode's row, whole or not at all.
+
+    Returns what it warned the user of.
+    """
+    with warnings.catch_warnings(record=True) as found:
+        block = roll_out_block(spec, job.setting, job.first, job.count, progress)
     for number, log in block.logs.items():
         save_episode(log, log_file(folder, job.setting.label, number))
     for row in block.rows:
         write_json(row_file(folder, job.setting, row["episode"]), row)
+    for one in found:
+        if one.category is not UserWarning:
+            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+    return [str(one.message) for one in found if one.category is UserWarning]
 
 
-def _run_missing(spec: Experiment, folder: Path, job: Job) -> None:
+def _run_missing(spec: Experiment, folder: Path, job: Job) -> list[str]:
     """Run a block unless it is done: a cluster asks again where a worker died with its result."""
-    if not _is_done(folder, job):
-        _run_block(spec, folder, job)
+    return [] if _is_done(folder, job) else _run_block(spec, folder, job)
 
 
 def _in_processes(
     spec: Experiment, folder: Path, left: list[Job], processes: int, cluster: str | None
-) -> Iterator[Job]:
-    """Run the blocks in worker processes; yields each block as it is done."""
+) -> Iterator[tuple[Job, list[str]]]:
+    """Run the blocks in worker processes; yields each block as it is done, and its warnings."""
     try:
         prepare = partial(name_code, named_code())
         with workers(processes, prepare, cluster) as pool:
             waiting = {pool.submit(_run_missing, spec, folder, job): job for job in left}
             for future in as_completed(waiting):
-                future.result()
-                yield waiting[future]
+                yield waiting[future], future.result()
     except BrokenProcessPool:
         raise InputError(
             f"one of {processes} processes was killed, perhaps for lack of memory; continue with "

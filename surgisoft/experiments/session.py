@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import warnings
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -164,13 +165,15 @@ def finish_experiment(
     about: str = "",
     progress: Progress = silent,
     cluster: str | None = None,
+    on_warning: Callable[[str], None] = warnings.warn,
 ) -> tuple[Results, list[Path]]:
     """Roll out what is not there yet and write tables, pictures, replays and the report.
 
     Returns the results and the files that were written. about: the command, for the report.
-    cluster: address of a Dask scheduler whose workers run the episodes.
+    cluster: address of a Dask scheduler whose workers run the episodes. on_warning: gets each
+    warning of the episodes once.
     """
-    rows = run_experiment(spec, folder, processes, progress, cluster)
+    rows = run_experiment(spec, folder, processes, progress, cluster, on_warning)
     results = sum_up(spec, folder, rows)
     files = write_tables(results)
     logs = {(label, n): results.log(label, n) for label, n in shown_episodes(results)}

@@ -5,6 +5,7 @@ Two processes give the same, too: `tests/cli/test_effect_files.py`, with an effe
 
 import json
 import shutil
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -39,6 +40,22 @@ def whole(tmp_path_factory):
 
 def _rows(folder):
     return [json.loads(path.read_text()) for path in sorted((folder / "rows").iterdir())]
+
+
+def test_a_warning_of_several_blocks_is_given_once(whole, tmp_path, monkeypatch):
+    spec, found, play = load_experiment(whole[0]), [], experiment_run.roll_out_block
+
+    def warned(*given):
+        warnings.warn("a model of another robot", stacklevel=1)
+        warnings.warn("overflow", RuntimeWarning, stacklevel=1)
+        return play(*given)
+
+    monkeypatch.setattr(experiment_run, "roll_out_block", warned)
+    open_results(spec, tmp_path / "r")
+    with pytest.warns(RuntimeWarning, match="overflow") as others:
+        run_experiment(spec, tmp_path / "r", on_warning=found.append)
+    assert found == ["a model of another robot"]
+    assert {other.category for other in others} == {RuntimeWarning}
 
 
 def test_tables_hold_every_episode(whole):

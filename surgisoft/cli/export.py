@@ -9,6 +9,7 @@ from surgisoft.cli import app
 from surgisoft.cli.options import EffectFiles
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
+from surgisoft.files import read_json
 
 
 @app.command()
@@ -68,7 +69,8 @@ def _run(source: Path, output: Path, which: str, check: bool) -> list[Path]:
     with progress(f"export {source}"):
         files = export_policy(policy, output, task)
     if not (output / "controller.py").is_file():
-        print("controller: not exported, see `note` in policy.json")
+        note = read_json(output / "policy.json")["note"]
+        print(f"controller: not exported, only the policies: {note}")
     elif check:
         with progress("one episode on the virtual rig"):
             found = check_on_rig(Controller(output), task, policy)

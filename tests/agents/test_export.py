@@ -216,6 +216,15 @@ def test_the_runner_says_what_is_wrong_with_a_measurement(exported):
         Controller(exported, "onx")
 
 
+def test_command_says_why_a_controller_is_not_exported(policy, tmp_path, capsys, monkeypatch):
+    def refuse(*given):
+        raise InputError("the observer draws random numbers")
+
+    monkeypatch.setattr("surgisoft.agents.export.ControllerGraph", refuse)
+    assert surgisoft(["export", str(policy.run.path), "-o", str(tmp_path / "y")]) == 0
+    assert "controller: not exported, only the policies: the observer" in capsys.readouterr().out
+
+
 def test_command_refuses_a_folder_without_a_run(tmp_path, capsys):
     assert surgisoft(["export", str(tmp_path), "-o", str(tmp_path / "y")]) == 2
     assert "no training run" in capsys.readouterr().err

@@ -73,6 +73,11 @@ CLEAN = {
 }
 
 
+def test_a_small_step_of_the_tip_may_hide_in_the_noise_of_the_others():
+    """The command steps at this row, and the tip by 2 % of its motion."""
+    assert find_warnings(steps(21734)) == []
+
+
 @pytest.mark.parametrize("kind", CLEAN)
 @given(seed=st.integers(0, 2**32))
 def test_no_false_alarm(kind, seed):

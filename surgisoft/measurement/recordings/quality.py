@@ -228,6 +228,12 @@ class _Track:
         good = (at >= 3) & (at < len(self.steps_mm) - 3)
         return np.where(good, self.steps_mm[at] / np.maximum(usual, 1e-12), 0.0)
 
+    def ratio_of(self, row: int, step_mm: float) -> float:
+        """A step of this length to a sample against the usual steps before and after it."""
+        at = np.searchsorted(self.rows[1:], [row])
+        usual = np.maximum(self._usual(at - STEP_WINDOW), self._usual(at + 1))
+        return float(step_mm / max(usual[0], 1e-12))
+
     def _usual(self, first: np.ndarray) -> np.ndarray:
         """(C,) median of the steps in the window that begins at each of these, as far as known."""
         padded, usual = self._padded_mm, np.zeros(len(first))
@@ -274,17 +280,22 @@ def _motion_mm(points: np.ndarray) -> np.ndarray:
 def key_point_jumps(recording: Recording) -> dict[int, list[tuple[int, float]]]:
     """By key point, the samples that it jumps to and how far [mm]; for continuous recordings."""
     points = recording.key_points_mm
-    motion_mm = _motion_mm(points).max()
+    motions_mm = _motion_mm(points)
+    motion_mm = motions_mm.max()
     hits: dict[int, list[tuple[int, float]]] = {}
     for run in recording.runs:
         tracks = [_track(points[run, j], run.start) for j in range(recording.key_points)]
         for j, track in enumerate(tracks):
-            others = [*tracks[:j], *tracks[j + 1 :]]
+            others = [
+                (other, motions_mm[i] / max(motions_mm[j], 1e-12))
+                for i, other in enumerate(tracks)
+                if i != j
+            ]
             large = np.flatnonzero(track.steps_mm > JUMP_SHARE * motion_mm)
             for at in large[track.ratios(large) > JUMP_RATIO].tolist():
                 row = int(track.rows[at + 1])
                 size = float(np.linalg.norm(points[row, j] - points[int(track.rows[at]), j]))
-                if not _explained(recording, others, run, row, size / motion_mm):
+                if not _explained(recording, others, run, row, size, size / motion_mm):
                     hits.setdefault(j, []).append((row, size))
     return hits
 
@@ -326,11 +337,20 @@ def _comes_back(true: np.ndarray, away: np.ndarray, next_: np.ndarray, size: flo
 
 
 def _explained(
-    recording: Recording, others: list[_Track], run: slice, row: int, share: float
+    recording: Recording,
+    others: list[tuple[_Track, float]],
+    run: slice,
+    row: int,
+    size: float,
+    share: float,
 ) -> bool:
-    """Whether a step of this share of the motion comes with a move of the actuation in the second
-    before, and with steps of the other key points where there are any."""
-    if others and not any(other.ratio_near(row) > JUMP_RATIO / 2 for other in others):
+    """Whether a step [mm], a share of the motion, comes with a move of the actuation in the second
+    before, and with steps of the other key points, as far as these would stand out of the noise.
+
+    others: tracks of the other key points, each with its motion over that of the one that steps.
+    """
+    witnesses = [other for other, part in others if other.ratio_of(row, size * part) > JUMP_RATIO]
+    if witnesses and not any(other.ratio_near(row) > JUMP_RATIO / 2 for other in witnesses):
         return False
     early = np.searchsorted(recording.t_s[run], recording.t_s[row] - 1.0) + run.start
     rows = slice(int(max(run.start, min(early, row - 5))), row + 1)

@@ -229,8 +229,13 @@ class _Track:
         return np.where(good, self.steps_mm[at] / np.maximum(usual, 1e-12), 0.0)
 
     def ratio_of(self, row: int, step_mm: float) -> float:
-        """A step of this length to a sample against the usual steps before and after it."""
-        at = np.searchsorted(self.rows[1:], [row])
+        """A step of this length to a sample against the usual steps before and after it.
+
+        0 where the track has no step.
+        """
+        if not len(self.steps_mm):
+            return 0.0
+        at = np.searchsorted(self.rows[1:-1], [row])
         usual = np.maximum(self._usual(at - STEP_WINDOW), self._usual(at + 1))
         return float(step_mm / max(usual[0], 1e-12))
 

@@ -110,6 +110,9 @@ MOST_MOVE, MOVE_S = 1 / 2, 3.0
 move have one cause, such as a way that the reference does not show, and alone raise no alarm."""
 CHARTS = 3
 """Charts of each component."""
+RISEN = 0.5
+"""Share of the threshold above which a chart takes part in the estimate of when the change came
+[-]. No alarm depends on it."""
 FAST = 0.5
 """Independent values of the slow part in a block from which on the arm moves fast [-]."""
 ENLARGE = 1.1
@@ -754,7 +757,7 @@ class Charts:
         kinds = ("level", "innovation", "fast moves")
         chart = int(self._charts.argmax())
         # One chart may have risen before the change; the most that have risen did so with it.
-        risen = self._charts > 0.5 * self.detector.threshold
+        risen = self._charts > RISEN * self.detector.threshold
         since_s = float(np.quantile(self._zero_s[risen], 0.5, method="lower"))
         squares = [square for at_s, square in self._recent if at_s > since_s]
         after = float(np.sqrt(np.mean(squares))) if squares else float("nan")

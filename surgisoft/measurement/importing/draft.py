@@ -19,7 +19,12 @@ SEPARATORS = (";", "\t", ",", "whitespace")
 """Separators that are tried; the one that gives the most columns of numbers is taken."""
 LOOKED_AT = 400
 """Most lines in which the first row of numbers is looked for (a count)."""
+LEAST_NUMBERS = 0.8
+"""Least share of the cells of a row of numbers that are numbers or empty [-]; the others may be
+words, such as the name of a phase."""
 NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?|nan|n/a|", re.I)
+"""A cell of a row of numbers: a number, or one that is missing. The patterns below are of column
+names in English and German, and what they find is marked for checking."""
 TIME = re.compile(r"t|time.*|zeit.*|(time)?stamps?|elapsed.*|clock|sec(onds)?", re.I)
 COMMAND = re.compile(r"cmd|command|soll|set ?point|desired|reference|(^|_)[cu]_?\d", re.I)
 ACTUATION = re.compile(
@@ -159,7 +164,9 @@ def _cells(line: str, separator: str) -> list[str]:
 def _numeric(row: Sequence[str]) -> bool:
     """Whether most cells are numbers, and not all are empty."""
     numbers = [NUMBER.fullmatch(cell.strip().strip('"')) is not None for cell in row]
-    return sum(numbers) >= 0.8 * len(row) and any(any(c.isdigit() for c in cell) for cell in row)
+    return sum(numbers) >= LEAST_NUMBERS * len(row) and any(
+        any(c.isdigit() for c in cell) for cell in row
+    )
 
 
 def _all_units(row: Sequence[str]) -> bool:

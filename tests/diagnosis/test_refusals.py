@@ -197,7 +197,7 @@ STILL = Frame(np.eye(3), np.zeros(3), np.array(1.0))
         (Explained(("key_points",), points=(1, 0, 2)), STILL, "base to tip they are k1, k0, k2"),
         (Explained(("length_unit",), mm_per_unit=10.0), STILL, "are in cm where mm are stated"),
         (Explained(("length_unit",), mm_per_unit=0.001), STILL, "1000 times too large: mm were re"),
-        (Explained(("length_unit",), mm_per_unit=0.3), STILL, "positions are 3.33333 times too larg"),
+        (Explained(("length_unit",), mm_per_unit=0.3), STILL, "positions are 3.33333 times too la"),
         (Explained(("length_unit",), mm_per_unit=3.0), STILL, "positions are 3 times too small"),
         (Explained(("actuation_unit",)), STILL, "the actuation is in psi where kPa is stated"),
         (
@@ -205,7 +205,7 @@ STILL = Frame(np.eye(3), np.zeros(3), np.array(1.0))
             STILL,
             "chambers 1, 2 are driven by channels 2, 1; the sign of chamber 1 is flipped",
         ),
-        (Explained(("chambers",), FLIPPED), STILL, "the sign of chambers 1, 2 are flipped"),
+        (Explained(("chambers",), FLIPPED), STILL, "the signs of chambers 1, 2 are flipped"),
         (Explained(("chambers",), IDLE), STILL, "chamber 2 does not act: the body moves as if it"),
         (
             Explained(("frame",)),

@@ -474,6 +474,7 @@ def test_what_is_claimed_is_written_with_its_page(bench, tmp_path, capsys, monke
     monkeypatch.setattr("surgisoft.diagnosis.compare.tables_of", lambda *_: {})
     pages = "surgisoft.diagnosis.pages.amendment"
     monkeypatch.setattr(f"{pages}.amend_page", lambda made, title, about: title)
+    monkeypatch.setattr("surgisoft.report.write_page", lambda page, file: f"{file}: {page}")
     monkeypatch.setattr(
         f"{pages}.write_improve_report", lambda made, tables, folder, title: [f"{folder}: {title}"]
     )
@@ -500,7 +501,7 @@ def test_what_is_claimed_is_written_with_its_page(bench, tmp_path, capsys, monke
     )  # fmt: skip
     assert saved == [new, new]
     assert Path(numbers).read_text().strip() == "{}"
-    assert "default with creep" in (tmp_path / "page" / "report.html").read_text()
+    assert f"{Path(page) / 'report.html'}: default with creep\n" in out
 
 
 def test_an_import_names_what_looks_wrong(bench, tmp_path, capsys, monkeypatch):

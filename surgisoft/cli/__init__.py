@@ -33,7 +33,7 @@ COMMANDS = (
     "train",
     "export",
     "evaluate",
-    "run",
+    "run_",
     "scene",
     "experiment",
     "rig",

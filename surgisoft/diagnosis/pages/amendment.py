@@ -13,6 +13,7 @@ from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
 from surgisoft.diagnosis.improve import NETWORK, Improvement, Round
 from surgisoft.diagnosis.pages.pictures import bodies, save
 from surgisoft.diagnosis.residuals import ResidualTable
+from surgisoft.errors import counted
 from surgisoft.files import new_file
 from surgisoft.report import (
     Command,
@@ -235,13 +236,13 @@ def _measured(table: ResidualTable) -> Section:
             )
         )
     header = ["recording", "rows", "duration", "runs", "actuation", "held out"]
-    text = (
-        f"{spec.chambers} chambers and {spec.key_points} key points of one arm were recorded. The "
-        f"noise of a key point is {table.floor.rmse_mm:.3f} mm ({table.floor.source}); no model "
-        "can have a smaller error."
-        if table.floor.rmse_mm is not None
-        else f"{spec.chambers} chambers and {spec.key_points} key points of one arm were recorded."
-    )
+    points = counted(spec.key_points, "key point")
+    text = f"{counted(spec.chambers, 'chamber')} and {points} of one arm were recorded."
+    if table.floor.rmse_mm is not None:
+        text += (
+            f" The noise of a key point is {table.floor.rmse_mm:.3f} mm ({table.floor.source}); no "
+            "model can have a smaller error."
+        )
     return Section("What was measured", [Text(text), Table(header, rows)])
 
 

@@ -37,7 +37,9 @@ HOW = (
     "with the model discrepancy beside them. The errors on top are those on the held-out part "
     "(the last quarter of each recording, of four runs or more the last ones), evaluated once.\n\n"
     "Intervals are 95 %, from a bootstrap of blocks of time, because consecutive rows have "
-    "correlated errors."
+    "correlated errors.\n\n"
+    "A parameter outside its plausible range, or with an interval over decades, is one that these "
+    "recordings do not determine: the prediction was validated, not the number."
 )
 POINTS = 600
 """Points of a line in a chart."""

@@ -36,7 +36,8 @@ def run(
         ),
     ] = None,
     processes: Annotated[
-        int, typer.Option(min=1, max=1024, help="Number of processes; the results do not depend on it.")
+        int,
+        typer.Option(min=1, max=1024, help="Number of processes; the results do not depend on it."),
     ] = 1,
     cluster: Cluster = None,
     resume: Annotated[

@@ -79,11 +79,15 @@ def test_what_a_header_does_not_say_is_marked(tmp_path):
     ],
 )
 def test_set_values_are_no_measurements(tmp_path, names, table):
-    text = draft_map(lab_file(tmp_path, f"t_ms,{names},x_m,y_m,z_m,x_soll_m,y_soll_m,z_soll_m"))
+    path = lab_file(tmp_path, f"t_ms,{names},x_m,y_m,z_m,x_soll_m,y_soll_m,z_soll_m")
+    text = draft_map(path)
     first, second = names.split(",")
     assert f"{table}" in text
     assert f'columns = ["{first}", "{second}"]' in text
     assert "# not used: x_soll_m, y_soll_m, z_soll_m" in text
+    found = imported(path, tmp_path)
+    assert (found.commanded is not None) == (table == "[commanded]")
+    np.testing.assert_allclose(found.measured, [row[1:3] for row in ROWS])
 
 
 def test_no_key_points_and_no_numbers_are_errors(tmp_path):

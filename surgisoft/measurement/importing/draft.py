@@ -95,6 +95,9 @@ def draft_map(path: str | Path) -> str:
         unit = _unit([time], SECONDS_PER, "s")
         lines += [f"column = {column([time])[0]}", f"unit = {unit}", ""]
     doubt = "" if commanded else "  # check: measured by sensors? Set values are [commanded]"
+    if commanded and not measured:
+        measured = commanded
+        doubt = "  # check: set values stand in, no sensor is here; fit with --actuation commanded"
     for table, found in ((f"[measured]{doubt}", measured), ("[commanded]", commanded)):
         if found:
             unit = _unit(found, ACTUATION_UNITS, "kPa")

@@ -20,6 +20,8 @@ from surgisoft.surrogate.history import History
 SIZE = 512
 """Most hashes of a sketch. Of 10,000 fitted rows 5 % of the hashes are in it, so that 3,000 other
 rows are judged by some 150 of them."""
+LEAST_KNOWN = 0.02
+"""Least share of some rows in the fit of a model from which on they took part in it."""
 
 
 @dataclass(frozen=True)
@@ -47,15 +49,22 @@ class FittedRows:
     def share_of(self, history: History, rows: np.ndarray | None = None) -> float:
         """Estimated share 0..1 of the measured rows of a history that the model was fitted to.
 
-        rows: (N,) bool, which rows of all runs one after another are asked about.
+        Equal rows count once: an arm at rest before coarse sensors gives the same row again and
+        again, in any recording. rows: (N,) bool, which rows of all runs one after another are asked
+        about.
         """
-        found = row_hashes(history, rows)
+        found = np.unique(row_hashes(history, rows))
         if not self.hashes or not len(found):
             return 0.0
         if len(self.hashes) == SIZE:
             found = found[found <= self.hashes[-1]]
         known = np.isin(found, np.array(self.hashes, np.uint64))
         return float(known.mean()) if len(found) else 0.0
+
+    def part_of(self, history: History, rows: np.ndarray | None = None) -> float:
+        """`share_of`, or 0 where it is less than `LEAST_KNOWN`: the rows took no part."""
+        share = self.share_of(history, rows)
+        return share if share >= LEAST_KNOWN else 0.0
 
     def to_json(self) -> dict:
         """Plain values for a model's `config.json`."""

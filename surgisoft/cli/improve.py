@@ -105,9 +105,9 @@ def improve(
         print(f"{output} was not written")
         raise typer.Exit(NOT_CLAIMED)
     print(f"wrote {output}: {result.model.summary()}")
-    following = with_effect_files(
-        f"surgisoft compare {model} {output} TEST.parquet --test --report PAGE"
-    )
+    known = result.model.fitted_rows
+    test = "TEST.parquet --test" if known is not None and known.complete else "TEST.parquet"
+    following = with_effect_files(f"surgisoft compare {model} {output} {test} --report PAGE")
     print(f"next, both on a recording that took no part: {following}")
 
 

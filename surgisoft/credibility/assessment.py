@@ -442,7 +442,7 @@ def _comparator(recording: Recording, context: Context, table: ResidualTable) ->
         rows=recording.samples,
         seconds=seconds,
         range=tuple(zip(signal.min(0).tolist(), signal.max(0).tolist(), strict=True)),
-        in_fit=None if known is None else known.part_of(history),
+        in_fit=None if known is None else known.certain_part_of(history),
     )
 
 

@@ -66,8 +66,9 @@ class Fall:
     """Probability that noise and the network's own error alone would have been fitted by so much of
     the effects; None where that was not tested."""
 
-    in_fit: float = 0.0
-    """Share of the rows that the old model had been fitted to: there its error is no test."""
+    in_fit: float | None = 0.0
+    """Share of the rows that the old model had been fitted to: there its error is no test. None
+    where that is not known."""
 
     @property
     def claimed(self) -> bool:
@@ -128,7 +129,8 @@ class Fall:
 
     def to_json(self) -> dict:
         """Plain values; `took_no_part`: whether the old model had been fitted to none of them."""
-        return asdict(self) | {"ci95": list(self.ci95), "took_no_part": not self.in_fit}
+        apart = None if self.in_fit is None else not self.in_fit
+        return asdict(self) | {"ci95": list(self.ci95), "took_no_part": apart}
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +199,7 @@ class Amendment:
     @property
     def _seen_before(self) -> bool:
         """Whether a joint fit is compared with a model that had been fitted to held-out rows."""
-        return self.refit is not None and self.held_out.in_fit > 0
+        return self.refit is not None and bool(self.held_out.in_fit)
 
     @property
     def sentence(self) -> str:
@@ -420,7 +422,7 @@ def fall_of(before: Problem, after: Problem, p_value: float | None = None) -> Fa
         rows=len(before.index),
         blocks=len(count),
         p_value=p_value,
-        in_fit=before.in_fit or 0.0,
+        in_fit=before.in_fit,
     )
 
 

@@ -66,11 +66,6 @@ def shares_in_fit(model: ArmModel, recordings: Iterable[Recording]) -> list[floa
 
 def refuse_rows_of_fit(model: ArmModel, recordings: Iterable[Recording]) -> None:
     """Raise InputError unless the recordings are known to have taken no part in the model's fit."""
-    if model.fitted_rows is None:
-        raise InputError(
-            "the model keeps no record of the rows that it was fitted to, expected one that does "
-            "for a test: whether the recordings took no part cannot be shown; leave out --test"
-        )
     recordings = list(recordings)
     for recording, share in zip(recordings, shares_in_fit(model, recordings), strict=True):
         if share:
@@ -79,6 +74,11 @@ def refuse_rows_of_fit(model: ArmModel, recordings: Iterable[Recording]) -> None
                 "expected a recording that took no part in the fit; give another one, or leave "
                 "out --test to see the error of the fit"
             )
+    if model.fitted_rows is None or not model.fitted_rows.complete:
+        raise InputError(
+            "the model keeps no record of all rows that it was fitted to, expected one that does "
+            "for a test: whether the recordings took no part cannot be shown; leave out --test"
+        )
 
 
 def held_out_in_fit(model: ArmModel, recordings: list[Recording], held_out: np.ndarray) -> float:

@@ -488,7 +488,7 @@ class Problem:
         Errors on rows of the fit are no errors on data that took no part in it.
         """
         known = self.model.fitted_rows
-        return None if known is None else known.part_of(self.history)
+        return None if known is None else known.certain_part_of(self.history)
 
     @property
     def noise_mm(self) -> np.ndarray:

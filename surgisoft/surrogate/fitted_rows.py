@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from torch import Tensor
@@ -32,6 +32,8 @@ class FittedRows:
     """Number of rows; of two sketches that were joined, of both."""
     hashes: tuple[int, ...]
     """The least hashes, ascending, at most SIZE; 64 bits each."""
+    complete: bool = True
+    """Whether these are all rows; not where a model that keeps no record was amended."""
 
     @classmethod
     def of(cls, histories: Iterable[History]) -> FittedRows:
@@ -40,11 +42,12 @@ class FittedRows:
         return cls(len(found), tuple(np.unique(found)[:SIZE].tolist()))
 
     def joined(self, other: FittedRows | None) -> FittedRows:
-        """The sketch of the rows of both."""
+        """The sketch of the rows of both; other: None where its rows are not known."""
         if other is None:
-            return self
+            return replace(self, complete=False)
         whole = sorted({*self.hashes, *other.hashes})[:SIZE]
-        return FittedRows(self.count + other.count, tuple(whole))
+        both = self.complete and other.complete
+        return FittedRows(self.count + other.count, tuple(whole), both)
 
     def share_of(self, history: History, rows: np.ndarray | None = None) -> float:
         """Estimated share 0..1 of the measured rows of a history that the model was fitted to.
@@ -66,14 +69,24 @@ class FittedRows:
         share = self.share_of(history, rows)
         return share if share >= LEAST_KNOWN else 0.0
 
+    def certain_part_of(self, history: History) -> float | None:
+        """`part_of`, or None where none of the rows is known but the record is not complete."""
+        share = self.part_of(history)
+        return share if share or self.complete else None
+
     def to_json(self) -> dict:
         """Plain values for a model's `config.json`."""
-        return {"rows": self.count, "hashes": [f"{value:016x}" for value in self.hashes]}
+        return {
+            "rows": self.count,
+            "complete": self.complete,
+            "hashes": [f"{value:016x}" for value in self.hashes],
+        }
 
     @classmethod
     def from_json(cls, values: dict) -> FittedRows:
         """The sketch of a model's `config.json`."""
-        return cls(int(values["rows"]), tuple(int(text, 16) for text in values["hashes"]))
+        hashes = tuple(int(text, 16) for text in values["hashes"])
+        return cls(int(values["rows"]), hashes, bool(values.get("complete", True)))
 
 
 def row_hashes(history: History, rows: np.ndarray | None = None) -> np.ndarray:

@@ -21,6 +21,7 @@ from surgisoft.measurement.recordings import Recording, load_recording, save_rec
 from surgisoft.report import write_page
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import load_model, save_model
+from surgisoft.surrogate.fitted_rows import FittedRows
 
 
 def recorded(take: int, rows: int = 1200) -> Recording:
@@ -67,11 +68,20 @@ def test_a_test_on_rows_of_the_fit_is_refused(model, known, other, suffix, rows,
         compare(model, [other, load_recording(file)], test=True)
 
 
-def test_a_test_needs_a_record_of_the_fit(model, other):
+def test_a_test_needs_a_record_of_the_fit(model, known, other):
+    """Of a model without a record, amending it makes none that is complete."""
     forgetful = model.replace()
     forgetful.fitted_rows = None
-    with pytest.raises(InputError, match="keeps no record of the rows"):
+    with pytest.raises(InputError, match="keeps no record of all rows"):
         compare(forgetful, [other], test=True)
+    amended = amend(forgetful, [known], "gain_mismatch", False, refit="never").model
+    with pytest.raises(InputError, match="keeps no record of all rows"):
+        compare(amended, [other], test=True)
+    assert compare(amended, [other])[0].to_json()["took_no_part"] is None
+    with pytest.raises(InputError, match="the model was fitted to"):
+        compare(amended, [known], test=True)
+    text = amended.fitted_rows.to_json()
+    assert FittedRows.from_json(text) == amended.fitted_rows
 
 
 def test_compare_says_what_the_error_is_no_test_of(model, known, other, tmp_path):

@@ -72,3 +72,11 @@ def test_amend_states_where_held_out_rows_were_in_the_fit(pair, model):
     again = amend(fresh.model, [pair[1]], "gain_mismatch", False, refit="never")
     assert again.held_out.in_fit == 0.0
     assert again.training.in_fit > 0.9
+
+
+def test_the_default_arm_knows_its_rows(pair):
+    """13,824 rows of the grid and 1,000 of the validation of `SOURCE.md`, none of other motion."""
+    known = load_model("default").fitted_rows
+    assert known.complete
+    assert (known.count, len(known.hashes)) == (14_824, SIZE)
+    assert known.share_of(history_of([pair[0]])) == 0.0

@@ -351,9 +351,7 @@ def _over_all(changes: Sequence[Change]) -> list[str]:
         "|---|---|---|---|---|---|---|",
     ]
     for motion, reference in itertools.product(MOTIONS, ("before", "begin")):
-        some = [
-            c for c in changes if (c.motion, c.reference, c.judges) == (motion, reference, True)
-        ]
+        some = [c for c in changes if c.judges and (c.motion, c.reference) == (motion, reference)]
         if not some:
             continue
         delays = np.array([np.inf if c.delay_s is None else c.delay_s for c in some])

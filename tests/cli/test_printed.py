@@ -50,7 +50,7 @@ def comparison(name: str, **fields) -> SimpleNamespace:
         "floor": SimpleNamespace(rmse_mm=0.05, source="holds"), "samples": 20, "missing": 0,
         "components_mm": {"x": 0.1, "y": 0.2}, "mse_mm2": 0.25, "per_key_point_mm": [0.25, NAN],
         "coverage": None, "time_shift": None, "axes": (), "change_axes": (), "worst": (),
-        "explainable": None, "rmse_ci95_mm": (0.4, 0.6),
+        "explainable": None, "rmse_ci95_mm": (0.4, 0.6), "in_fit": 0.0, "rows_of_fit": "",
     }  # fmt: skip
     table = SimpleNamespace(model=SimpleNamespace(summary=lambda: "an arm"))
     numbers = result(**(values | fields))
@@ -134,7 +134,8 @@ def diagnosis(**fields) -> SimpleNamespace:
         "verdict": SimpleNamespace(kind="setup", sentence="the frame is turned"),
         "error_mm": SimpleNamespace(before=0.5, floor=0.05, ceiling=0.1), "track": None,
         "setup": None, "next_command": "", "next_experiment": None, "refit": None, "checks": (),
-        "shown": (), "not_testable": (), "seconds": 1.5,
+        "shown": (), "not_testable": (), "seconds": 1.5, "in_fit": 0.0,
+        "left_out": "held-out blocks",
     }  # fmt: skip
     return result(**(values | fields))
 
@@ -229,7 +230,7 @@ def test_amend_and_improve_write_nothing_where_nothing_is_claimed(
     ]  # fmt: skip
     found = result(
         claimed=False, rounds=rounds, steps=[("creep", 0.3)], parameters=[PARAMETER, UNITLESS],
-        held_out=SimpleNamespace(before=0.5, floor=0.1), sentence="no significant fall",
+        held_out=SimpleNamespace(before=0.5, floor=0.1, in_fit=0.0), sentence="no significant fall",
     )  # fmt: skip
     command = ["improve", "default", rec, "-o", new, "--json", numbers + ".json"]
     target = "surgisoft.diagnosis.improve.improve"
@@ -254,7 +255,7 @@ def test_amend_and_improve_write_nothing_where_nothing_is_claimed(
         "amend", "default", "--effect", "creep", "--data", rec, "-o", new, code=1,
     )  # fmt: skip
     assert "creep: the model had this effect already; its parameters were fitted again\n" in out
-    assert "the network's last layer was fitted again, which lowers the error on held-out" in out
+    assert "the network's last layer was fitted again, which lowers the error on motion th" in out
     assert "creep lowers it, with parts of the training data left out\n" in out
     assert f"{new} was not written; --anyway writes it nevertheless" in out
     assert not Path(new).exists()
@@ -484,7 +485,7 @@ def test_what_is_claimed_is_written_with_its_page(bench, tmp_path, capsys, monke
     found = result(
         claimed=True, rounds=[], steps=[], parameters=[], effects=("creep",), refitted=(),
         retuned=False, refit=None, sentence="the error falls",
-        model=SimpleNamespace(summary=lambda: "an arm"),
+        model=SimpleNamespace(summary=lambda: "an arm", fitted_rows=None),
     )  # fmt: skip
     out = printed(
         capsys, monkeypatch, "surgisoft.diagnosis.improve.improve", found,

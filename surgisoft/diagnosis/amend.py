@@ -131,7 +131,7 @@ class Amendment:
     effects: tuple[str, ...]
     """The effects asked for."""
     refitted: tuple[str, ...]
-    """Those that the model had before: their parameters were fitted anew."""
+    """Effects that the model had before and whose parameters were fitted again."""
     parameters: tuple[Parameter, ...]
     """The fitted parameters in physical units."""
     held_out: Fall

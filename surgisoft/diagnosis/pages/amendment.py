@@ -13,6 +13,7 @@ from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
 from surgisoft.diagnosis.improve import NETWORK, Improvement, Round
 from surgisoft.diagnosis.pages.pictures import bodies, save
 from surgisoft.diagnosis.residuals import ResidualTable
+from surgisoft.errors import counted
 from surgisoft.files import new_file
 from surgisoft.report import (
     Command,
@@ -36,7 +37,9 @@ HOW = (
     "with the model discrepancy beside them. The errors on top are those on the held-out part "
     "(the last quarter of each recording, of four runs or more the last ones), evaluated once.\n\n"
     "Intervals are 95 %, from a bootstrap of blocks of time, because consecutive rows have "
-    "correlated errors."
+    "correlated errors.\n\n"
+    "A parameter outside its plausible range, or with an interval over decades, is one that these "
+    "recordings do not determine: the prediction was validated, not the number."
 )
 POINTS = 600
 """Points of a line in a chart."""
@@ -235,13 +238,13 @@ def _measured(table: ResidualTable) -> Section:
             )
         )
     header = ["recording", "rows", "duration", "runs", "actuation", "held out"]
-    text = (
-        f"{spec.chambers} chambers and {spec.key_points} key points of one arm were recorded. The "
-        f"noise of a key point is {table.floor.rmse_mm:.3f} mm ({table.floor.source}); no model "
-        "can have a smaller error."
-        if table.floor.rmse_mm is not None
-        else f"{spec.chambers} chambers and {spec.key_points} key points of one arm were recorded."
-    )
+    points = counted(spec.key_points, "key point")
+    text = f"{counted(spec.chambers, 'chamber')} and {points} of one arm were recorded."
+    if table.floor.rmse_mm is not None:
+        text += (
+            f" The noise of a key point is {table.floor.rmse_mm:.3f} mm ({table.floor.source}); no "
+            "model can have a smaller error."
+        )
     return Section("What was measured", [Text(text), Table(header, rows)])
 
 

@@ -12,7 +12,7 @@ by weights that its run took no part in. The arcs, which have few parameters, ar
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -30,6 +30,9 @@ TIMES_S = (0.1, 0.3, 1.0, 4.0)
 the relaxation of a silicone wall. The error hardly depends on them."""
 LANDMARKS = 400
 """Most landmarks. On two real arms 800 lowered the error by less than a hundredth."""
+LAG_FIRMNESS = 10.0
+"""Factor on the ridges of the arcs' bends and stretches by the lags: what a wall's lag adds is
+about a third of what the actuation itself does."""
 WIDTHS = (0.5, 1.0, 2.0, 4.0)
 """Widths of the kernel that are tried, in half ranges of a chamber."""
 LAG_SHARES = (0.5, 1.0)
@@ -125,9 +128,22 @@ def _before(data: Data, spec: ArmSpec, times_s: tuple[float, ...]) -> tuple[ArmM
     landmarks = min(LANDMARKS, int(measured_rows(history).sum()))
     network = KernelArm(low, high, spec.key_points, arcs, landmarks, times_s)
     rest = rest_shape(history)
+    model = ArmModel(spec, network, rest_mm=rest)
+    wide = replace(history, pressure=_inputs(model, network, history))
+    firmness = torch.full((wide.chambers,), LAG_FIRMNESS)
+    firmness[: spec.chambers] = 1.0
     with torch.enable_grad():
-        fit_prior_mean(network.prior, history, rest)
-    return ArmModel(spec, network, rest_mm=rest), network
+        fit_prior_mean(network.prior, wide, rest, firmness)
+    return model, network
+
+
+def _inputs(model: ArmModel, network: KernelArm, history: History) -> Tensor:
+    """(R, T, F) inputs of arcs and kernel along a history, before weights, in the arm's unit."""
+    actuation = model.chain.chambers(history.pressure)
+    if not network.remembers:
+        return actuation
+    start = model.chain.standing(model.first_pressure(history), signals=False)[0].memory
+    return network.inputs(actuation, network.lows(actuation, history, next(iter(start.values()))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,22 +153,17 @@ class _Rows:
     pressure: Tensor
     """(S, m) actuation, in the arm's unit."""
     inputs: Tensor
-    """(S, F) inputs of the kernel, before their weights."""
+    """(S, F) inputs of the kernel in half ranges, before their weights."""
     target: Tensor
     """(S, 3n) measured key points less those of the arcs, mm; NaN where missing."""
 
     @classmethod
     def of(cls, model: ArmModel, network: KernelArm, history: History, picked: Tensor) -> "_Rows":
         """The rows of a history with an index (S,) among those without padding."""
-        start = model.chain.standing(model.first_pressure(history), signals=False)[0].memory
-        actuation = model.chain.chambers(history.pressure)
-        pressure, memory = history.rows(actuation)[picked], None
-        if network.remembers:
-            lows = network.lows(actuation, history, next(iter(start.values())))
-            memory = history.rows(lows)[picked]
-        target = history.rows(history.key_points)[picked] - network.prior(pressure)
-        inputs = network.inputs(pressure, memory)
-        return cls(pressure, inputs.double(), target.flatten(1).double())
+        inputs = history.rows(_inputs(model, network, history))[picked]
+        pressure = inputs[:, : history.chambers]
+        target = history.rows(history.key_points)[picked] - network.prior(inputs)
+        return cls(pressure, network.scaled(inputs).double(), target.flatten(1).double())
 
 
 @dataclass(frozen=True, eq=False)

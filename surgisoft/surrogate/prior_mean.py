@@ -38,8 +38,14 @@ def arcs_of(points: Tensor) -> int:
     return points.shape[1] - int(motion[0] < STILL * motion[-1])
 
 
-def fit_prior_mean(prior: ArcChain, history: History, rest: Tensor) -> None:
-    """Fit a prior mean to the measured rows of a history; rest: (n, 3) key points at rest, mm."""
+def fit_prior_mean(
+    prior: ArcChain, history: History, rest: Tensor, firmness: Tensor | None = None
+) -> None:
+    """Fit a prior mean to the measured rows of a history.
+
+    rest: (n, 3) key points at rest, mm; firmness: (F,) factors on the ridges of each input of the
+    arcs, default 1.
+    """
     prior.set_rest(rest)
     points = history.rows(history.key_points)
     seen = (~points.isnan()).all(-1).any(-1)
@@ -51,6 +57,7 @@ def fit_prior_mean(prior: ArcChain, history: History, rest: Tensor) -> None:
     mean = points.sum(0) / known.sum(0).clamp(min=1)
     motion = float(((points - mean) * known).square().sum() / count)
     prior.double()
+    firm = torch.ones(pressure.shape[1]) if firmness is None else firmness
     parameters = list(prior.parameters())
     optimiser = torch.optim.LBFGS(
         parameters, max_iter=ITERATIONS, history_size=30, line_search_fn="strong_wolfe"
@@ -59,8 +66,8 @@ def fit_prior_mean(prior: ArcChain, history: History, rest: Tensor) -> None:
     def loss() -> Tensor:
         optimiser.zero_grad()
         left = ((prior(pressure) - points) * known).square().sum() / count
-        held = RIDGE * prior.table[:, :2, :-1].square().sum()
-        held = held + STRETCH_RIDGE * prior.table[:, 2, :-1].square().sum()
+        held = RIDGE * (firm * prior.table[:, :2, :-1].square()).sum()
+        held = held + STRETCH_RIDGE * (firm * prior.table[:, 2, :-1].square()).sum()
         held = held + OFFSET_RIDGE * prior.offset.square().sum()
         total = left / motion + held
         total.backward()

@@ -5,34 +5,33 @@ The weights W of the landmarks are those of kernel ridge regression (Williams & 
     (K' K + ridge K_l + jitter rows I) W = K' (measured - arcs),
 
 with K the kernels of rows and landmarks, K_l those of the landmarks. Width of the kernel, share of
-the lags in the inputs and ridge are those of least error when whole runs, or long blocks of time,
-are left out. The same errors validate the model and calibrate its interval: each row is predicted
-by weights that its run took no part in. The arcs, which have few parameters, are fitted once.
+the lags in its inputs and ridge are those of least error when whole runs, or long blocks of time,
+are left out. The same errors validate the model and calibrate its interval:
+each row is predicted by arcs and weights that its run took no part in.
 """
 
+import copy
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from surgisoft.errors import InputError
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.interval import ErrorInterval, calibrate, distance_across
 from surgisoft.surrogate.model import ArmModel
-from surgisoft.surrogate.networks import KernelArm, gaussian_kernel
-from surgisoft.surrogate.prior_mean import arcs_of, fit_prior_mean
+from surgisoft.surrogate.networks import ArcChain, KernelArm, gaussian_kernel
+from surgisoft.surrogate.prior_mean import arcs_of, fit_arcs
 from surgisoft.surrogate.training import Data, dealt, measured_rows, rest_shape
 
 TIMES_S = (0.1, 0.3, 1.0, 4.0)
 """Time constants of the low passes, s: about half a decade apart, from the lag of a short line to
 the relaxation of a silicone wall. The error hardly depends on them."""
 LANDMARKS = 400
-"""Most landmarks. On two real arms 800 lowered the error by less than a hundredth."""
-LAG_FIRMNESS = 10.0
-"""Factor on the ridges of the arcs' bends and stretches by the lags: what a wall's lag adds is
-about a third of what the actuation itself does."""
+"""Most landmarks. On two real arms 800 lowered the error by a few hundredths."""
 WIDTHS = (0.5, 1.0, 2.0, 4.0)
 """Widths of the kernel that are tried, in half ranges of a chamber."""
 LAG_SHARES = (0.5, 1.0)
@@ -45,6 +44,8 @@ MOST_ROWS = 6000
 """Largest number of rows that are fitted to, evenly thinned."""
 FOLDS = 8
 """Most folds of groups; held-out rows are one fold more."""
+FOLD_ITERATIONS = 40
+"""Most iterations of the arcs without a fold, which start from those of all rows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +57,7 @@ class KernelFit:
     held: Tensor
     """(S,) which of the rows below the other networks of a fit hold out."""
     predicted_mm: Tensor
-    """(S, n, 3) key points of rows, each by weights that its group took no part in, mm."""
+    """(S, n, 3) key points of rows, each by a model that its group took no part in, mm."""
     measured_mm: Tensor
     """(S, n, 3) measured key points of these rows, mm; NaN where missing."""
     interval: ErrorInterval | None
@@ -65,7 +66,6 @@ class KernelFit:
     """Width, share of the lags and ridge that were chosen, for a person."""
 
 
-@torch.no_grad()
 def fit_kernel(
     data: Data,
     spec: ArmSpec,
@@ -79,151 +79,156 @@ def fit_kernel(
     trial, trials and least cross-validated loss in mm^2.
     """
     history = data.train
-    model, network = _before(data, spec, TIMES_S if clock else ())
     seen = measured_rows(history)
-    step = max(1, -(-int(seen.sum()) // MOST_ROWS))
-    picked = seen.nonzero()[:, 0][::step]
-    rows = _Rows.of(model, network, history, picked)
+    picked = seen.nonzero()[:, 0][:: max(1, -(-int(seen.sum()) // MOST_ROWS))]
+    low, high = torch.tensor(spec.low), torch.tensor(spec.high)
+    points = history.rows(history.key_points)[picked]
+    landmarks, times_s = min(LANDMARKS, len(picked)), TIMES_S if clock else ()
+    network = KernelArm(low, high, spec.key_points, arcs_of(points), landmarks, times_s)
+    model = ArmModel(spec, network, rest_mm=rest_shape(history))
+    pressure, inputs = (x[picked] for x in _inputs(model, network, history))
     held = torch.zeros(len(picked), dtype=torch.bool)
     if data.held is not None:
         held = history.rows(data.held)[picked]
     generator = torch.Generator().manual_seed(seed)
     group = dealt(history)[picked]
     fold = _folds(group, held, generator)
-    marks = torch.randperm(len(picked), generator=generator)[: network.landmarks]
-    best: tuple[float, Tensor, float, str] | None = None
-    best_left = rows.target
+    if len(fold.unique()) < 2:
+        raise InputError(
+            "key points in one run, or one block of time, only: kernel regression chooses its "
+            "width by runs that are left out; record more, or fit --network haw_nn"
+        )
+    marks = torch.randperm(len(picked), generator=generator)[:landmarks]
     shares = LAG_SHARES if clock else LAG_SHARES[-1:]
     trials = list(itertools.product(WIDTHS, shares))
-    for number, (width, share) in enumerate(trials, 1):
-        weight = torch.full_like(rows.inputs[0], share / width)
-        weight[: spec.chambers] = 1.0 / width
-        system = _System.of(rows.inputs * weight, marks, rows.target, fold)
-        for ridge in RIDGES:
-            left = system.left_out(ridge)
-            loss = float((left - rows.target).square().nansum(-1).mean())
-            if best is None or loss < best[0]:
-                text = f"width {width:g}, lags x {share:g}, ridge {ridge:g}"
-                best, best_left = (loss, weight, ridge, text), left
+    network.prior.set_rest(model.rest_mm)
+    fit_arcs(network.prior, pressure, points)
+    without = _arcs_without(network.prior, pressure, points, fold)
+    best: _Trial | None = None
+    with torch.no_grad():
+        for number, (width, share) in enumerate(trials, 1):
+            weight = torch.full_like(inputs[0], share / width)
+            weight[: spec.chambers] = 1.0 / width
+            system = _System(inputs * weight, marks, fold, points, without)
+            for ridge in RIDGES:
+                left = system.left_out(ridge)
+                loss = float((left - points).square().sum(-1).nanmean())
+                if best is None or loss < best.loss:
+                    text = f"width {width:g}, lags x {share:g}, ridge {ridge:g}"
+                    best = _Trial(loss, weight, ridge, left, text)
+            assert best is not None
+            progress(number, len(trials), best.loss)
         assert best is not None
-        progress(number, len(trials), best[0] / spec.key_points)
-    assert best is not None
-    _, weight, ridge, settings = best
-    final = _System.of(rows.inputs * weight, marks, rows.target, fold)
-    network.input_weight.copy_(weight)
-    network.places.copy_(final.places)
-    network.weight.copy_(final.weights(ridge))
-    left = (best_left - rows.target).unflatten(1, (spec.key_points, 3)).float()
-    distance = distance_across(rows.pressure, fold, torch.tensor(spec.span))
-    interval = calibrate(left.norm(dim=-1), distance, group, "cross-validation")
-    measured = history.rows(history.key_points)[picked]
-    return KernelFit(model, held, measured + left, measured, interval, settings)
+        x = inputs * best.weight
+        network.input_weight.copy_(best.weight)
+        network.places.copy_(x[marks])
+        network.weight.copy_(_weights(x, marks, points - network.prior(pressure), best.ridge))
+        left = (best.left_out_mm - points).norm(dim=-1)
+        distance = distance_across(pressure, fold, torch.tensor(spec.span))
+    interval = calibrate(left, distance, group, "cross-validation")
+    return KernelFit(model, held, best.left_out_mm, points, interval, best.text)
 
 
-def _before(data: Data, spec: ArmSpec, times_s: tuple[float, ...]) -> tuple[ArmModel, KernelArm]:
-    """A model whose arcs are fitted and whose weights are zero, and its network."""
-    history = data.train
-    low, high = torch.tensor(spec.low), torch.tensor(spec.high)
-    arcs = arcs_of(history.rows(history.key_points))
-    landmarks = min(LANDMARKS, int(measured_rows(history).sum()))
-    network = KernelArm(low, high, spec.key_points, arcs, landmarks, times_s)
-    rest = rest_shape(history)
-    model = ArmModel(spec, network, rest_mm=rest)
-    wide = replace(history, pressure=_inputs(model, network, history))
-    firmness = torch.full((wide.chambers,), LAG_FIRMNESS)
-    firmness[: spec.chambers] = 1.0
-    with torch.enable_grad():
-        fit_prior_mean(network.prior, wide, rest, firmness)
-    return model, network
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """Settings and their cross-validated error."""
+
+    loss: float
+    """Mean squared distance over all rows, mm^2."""
+    weight: Tensor
+    """(F,) weights of the kernel's inputs."""
+    ridge: float
+    """Ridge."""
+    left_out_mm: Tensor
+    """(S, n, 3) prediction of each row by a model that its fold took no part in, mm."""
+    text: str
+    """The settings for a person."""
 
 
-def _inputs(model: ArmModel, network: KernelArm, history: History) -> Tensor:
-    """(R, T, F) inputs of arcs and kernel along a history, before weights, in the arm's unit."""
-    actuation = model.chain.chambers(history.pressure)
+@torch.no_grad()
+def _inputs(model: ArmModel, network: KernelArm, history: History) -> tuple[Tensor, Tensor]:
+    """(S, m) chamber pressures, in the arm's unit, and (S, F) inputs of the kernel, unweighted."""
+    pressure = model.chain.chambers(history.pressure)
     if not network.remembers:
-        return actuation
+        return history.rows(pressure), history.rows(network.inputs(pressure))
     start = model.chain.standing(model.first_pressure(history), signals=False)[0].memory
-    return network.inputs(actuation, network.lows(actuation, history, next(iter(start.values()))))
+    lows = network.lows(pressure, history, next(iter(start.values())))
+    return history.rows(pressure), history.rows(network.inputs(pressure, lows))
 
 
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Rows to fit to, in double precision."""
-
-    pressure: Tensor
-    """(S, m) actuation, in the arm's unit."""
-    inputs: Tensor
-    """(S, F) inputs of the kernel in half ranges, before their weights."""
-    target: Tensor
-    """(S, 3n) measured key points less those of the arcs, mm; NaN where missing."""
-
-    @classmethod
-    def of(cls, model: ArmModel, network: KernelArm, history: History, picked: Tensor) -> "_Rows":
-        """The rows of a history with an index (S,) among those without padding."""
-        inputs = history.rows(_inputs(model, network, history))[picked]
-        pressure = inputs[:, : history.chambers]
-        target = history.rows(history.key_points)[picked] - network.prior(inputs)
-        return cls(pressure, network.scaled(inputs).double(), target.flatten(1).double())
+def _arcs_without(whole: ArcChain, pressure: Tensor, points: Tensor, fold: Tensor) -> list[Tensor]:
+    """For each fold (S, n, 3) mm: key points in all rows by arcs that are fitted without it."""
+    found = []
+    for number in range(int(fold.max()) + 1):
+        others, arcs = fold != number, copy.deepcopy(whole)
+        fit_arcs(arcs, pressure[others], points[others], FOLD_ITERATIONS)
+        with torch.no_grad():
+            found.append(arcs(pressure))
+    return found
 
 
-@dataclass(frozen=True, eq=False)
 class _System:
-    """Normal equations of each fold, for each set of outputs that are measured in the same rows."""
+    """Normal equations without each fold, for each set of outputs measured in the same rows."""
 
-    kernel: Tensor
-    """(S, L) kernels of rows and landmarks."""
-    places: Tensor
-    """(L, F) landmarks."""
-    fold: Tensor
-    """(S,) fold of each row."""
-    parts: list[tuple[Tensor, Tensor, Tensor]]
-    """Outputs (O,), K' K of each fold (G, L, L), and K' y of each fold (G, L, O)."""
-
-    @classmethod
-    def of(cls, x: Tensor, marks: Tensor, target: Tensor, fold: Tensor) -> "_System":
-        """The system of inputs x (S, F), landmarks at rows (L,), targets (S, 3n), folds (S,)."""
-        places = x[marks]
-        kernel = gaussian_kernel(x, places)
-        alike: dict[bytes, list[int]] = {}
-        for output, missing in enumerate(target.isnan().unbind(1)):
-            alike.setdefault(missing.numpy().tobytes(), []).append(output)
-        parts = []
-        for outputs in alike.values():
-            known = ~target[:, outputs[0]].isnan()
-            some = [known & (fold == number) for number in range(int(fold.max()) + 1)]
-            grams = torch.stack([kernel[rows].T @ kernel[rows] for rows in some])
-            sides = torch.stack([kernel[rows].T @ target[rows][:, outputs] for rows in some])
-            parts.append((torch.tensor(outputs), grams, sides))
-        return cls(kernel, places, fold, parts)
-
-    def _held(self, ridge: float) -> Tensor:
-        """(L, L) what the ridge and the jitter add."""
-        between = gaussian_kernel(self.places, self.places)
-        jitter = JITTER * len(self.kernel) * torch.eye(len(between), dtype=between.dtype)
-        return ridge * between + jitter
+    def __init__(
+        self, x: Tensor, marks: Tensor, fold: Tensor, points: Tensor, without: list[Tensor]
+    ):
+        """Inputs x (S, F), landmarks at rows (L,), folds (S,), key points (S, n, 3) mm, and for
+        each fold (S, n, 3) mm those of arcs without it."""
+        self.kernel = gaussian_kernel(x, x[marks]).double()
+        self.between, self.jitter = _held(x, marks, len(x))
+        self.rows = [fold == number for number in range(len(without))]
+        self.without = without
+        self.parts = []
+        for outputs, known in _alike(points):
+            grams, sides = [], []
+            for mine, arcs in zip(self.rows, without, strict=True):
+                own, others = known & mine, known & ~mine
+                target = (points - arcs).flatten(1)[others][:, outputs].double()
+                grams.append(self.kernel[own].T @ self.kernel[own])
+                sides.append(self.kernel[others].T @ target)
+            self.parts.append((outputs, torch.stack(grams), torch.stack(sides)))
 
     def left_out(self, ridge: float) -> Tensor:
-        """(S, 3n) prediction of each row by weights that its fold took no part in."""
-        held, found = self._held(ridge), self.kernel.new_zeros(len(self.fold), self._outputs)
+        """(S, n, 3) mm: key points of each row by arcs and weights without its fold."""
+        found = self.without[0].clone()
+        for mine, arcs in zip(self.rows, self.without, strict=True):
+            found[mine] = arcs[mine]
+        flat = found.flatten(1)
         for outputs, grams, sides in self.parts:
-            others = grams.sum(0) - grams + held
-            weights = torch.linalg.solve(others, sides.sum(0) - sides)
-            for number, weight in enumerate(weights):
-                rows = (self.fold == number).nonzero()[:, 0]
-                found[rows[:, None], outputs] = self.kernel[rows] @ weight
-        return found
+            others = grams.sum(0) - grams + ridge * self.between + self.jitter
+            weights = torch.linalg.solve(others, sides)
+            for mine, weight in zip(self.rows, weights, strict=True):
+                rows = mine.nonzero()[:, 0]
+                flat[rows[:, None], outputs] += (self.kernel[mine] @ weight).to(flat.dtype)
+        return flat.view_as(found)
 
-    def weights(self, ridge: float) -> Tensor:
-        """(L, 3n) weights of all rows."""
-        found = self.kernel.new_zeros(len(self.places), self._outputs)
-        for outputs, grams, sides in self.parts:
-            solved = torch.linalg.solve(grams.sum(0) + self._held(ridge), sides.sum(0))
-            found[:, outputs] = solved
-        return found
 
-    @property
-    def _outputs(self) -> int:
-        return sum(len(outputs) for outputs, _, _ in self.parts)
+def _alike(points: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """Outputs (O,) of key points (S, n, 3) that are measured in the same rows, and these (S,)."""
+    found: dict[bytes, list[int]] = {}
+    for output, missing in enumerate(points.flatten(1).isnan().unbind(1)):
+        found.setdefault(missing.numpy().tobytes(), []).append(output)
+    flat = points.flatten(1)
+    return [(torch.tensor(some), ~flat[:, some[0]].isnan()) for some in found.values()]
+
+
+def _held(x: Tensor, marks: Tensor, rows: int) -> tuple[Tensor, Tensor]:
+    """(L, L) each: kernels of the landmarks, which the ridge is a factor of, and the jitter."""
+    between = gaussian_kernel(x[marks], x[marks]).double()
+    return between, JITTER * rows * torch.eye(len(marks), dtype=between.dtype)
+
+
+def _weights(x: Tensor, marks: Tensor, target: Tensor, ridge: float) -> Tensor:
+    """(L, 3n) weights for inputs x (S, F) and targets (S, n, 3) in mm of all rows."""
+    kernel = gaussian_kernel(x, x[marks]).double()
+    between, jitter = _held(x, marks, len(x))
+    found = kernel.new_zeros(len(marks), target.flatten(1).shape[1])
+    for outputs, known in _alike(target):
+        some = kernel[known]
+        side = some.T @ target.flatten(1)[known][:, outputs].double()
+        found[:, outputs] = torch.linalg.solve(some.T @ some + ridge * between + jitter, side)
+    return found
 
 
 def _folds(group: Tensor, held: Tensor, generator: torch.Generator) -> Tensor:

@@ -399,15 +399,16 @@ class KernelArm(nn.Module):
 
     With the scaled actuation p, its low passes q_k of the time constants tau_k, and landmarks x_l,
 
-        key points = arcs(z) + sum_l w_l exp(-|x - x_l|^2 / 2),   z = [p, p - q_1, ...],  x = a z,
+        key points = arcs(p) + sum_l w_l exp(-|x - x_l|^2 / 2),   x = a [p, b (p - q_1), ...].
 
-    where the bends and stretches of the arcs are linear in z: an arm of constant curvature whose
-    wall lags linearly. This is the mean of a Gaussian process with the arcs as its prior mean
-    (Rasmussen & Williams 2006, sec. 2.7), on landmarks (Nyström approximation, Williams & Seeger
-    2001): far from the data it returns to the arcs. A bank of low passes represents a fading memory
-    (Boyd & Chua 1985); in steady state all p - q_k are zero.
+    This is the mean of a Gaussian process with the arcs as its prior mean (Rasmussen & Williams
+    2006, sec. 2.7), on landmarks (Nyström approximation, Williams & Seeger 2001): far from the data
+    it returns to the arcs. A bank of low passes represents a fading memory (Boyd & Chua 1985); in
+    steady state all p - q_k are zero.
     """
 
+    centre: Tensor
+    half_range: Tensor
     times: Tensor
     input_weight: Tensor
     places: Tensor
@@ -431,10 +432,11 @@ class KernelArm(nn.Module):
         super().__init__()
         self.key_points, self.arcs, self.landmarks = key_points, arcs, landmarks
         self.times_s = tuple(float(time) for time in times_s)
-        _, half = centre_and_half(low, high)
-        lags = half.repeat_interleave(len(self.times_s))
-        self.prior = ArcChain(torch.cat([low, -lags]), torch.cat([high, lags]), key_points, arcs)
+        self.prior = ArcChain(low, high, key_points, arcs)
+        centre, half = centre_and_half(low, high)
         inputs = len(low) * (1 + len(self.times_s))
+        self.register_buffer("centre", centre)
+        self.register_buffer("half_range", half)
         self.register_buffer("times", torch.tensor(self.times_s), persistent=False)
         self.register_buffer("input_weight", torch.ones(inputs))
         self.register_buffer("places", torch.zeros(landmarks, inputs))
@@ -463,29 +465,27 @@ class KernelArm(nn.Module):
         return torch.exp(-dt_s[..., None, None] / self.times)
 
     def inputs(self, pressure: Tensor, memory: Tensor | None = None) -> Tensor:
-        """(..., m (1 + K)) actuation, and how far it is ahead of its low passes, in its unit.
+        """(..., m (1 + K)) scaled actuation and lags, before weights.
 
         pressure: (..., m) in the arm's unit; memory: (..., m, K) low passes of it, None in
         steady state.
         """
+        x = (pressure - self.centre) / self.half_range
         if not self.remembers:
-            return pressure
+            return x
         if memory is None:
             memory = pressure.unsqueeze(-1).expand(*pressure.shape, len(self.times_s))
-        return torch.cat([pressure, (pressure.unsqueeze(-1) - memory).flatten(-2)], -1)
-
-    def scaled(self, inputs: Tensor) -> Tensor:
-        """(..., m (1 + K)) inputs in half ranges of a chamber, times their weights."""
-        return (inputs - self.prior.centre) / self.prior.half_range * self.input_weight
+        lag = (pressure.unsqueeze(-1) - memory) / self.half_range.unsqueeze(-1)
+        return torch.cat([x, lag.flatten(-2)], -1)
 
     def forward(self, pressure: Tensor, direction: Tensor, memory: Tensor | None = None) -> Tensor:
         """Key points (..., n, 3) in mm, base frame, from pressure (..., m), low passes (..., m, K).
 
         memory: None stands for steady state.
         """
-        inputs = self.inputs(pressure, memory)
-        near = gaussian_kernel(self.scaled(inputs), self.places)
-        return self.prior(inputs) + (near @ self.weight).unflatten(-1, (self.key_points, 3))
+        x = self.inputs(pressure, memory) * self.input_weight
+        near = gaussian_kernel(x, self.places)
+        return self.prior(pressure) + (near @ self.weight).unflatten(-1, (self.key_points, 3))
 
     def lows(self, actuation: Tensor, history: History, memory: Tensor | None) -> Tensor:
         """(R, T, m, K) low passes along actuation (R, T, m) of a history's runs.

@@ -1,6 +1,7 @@
 """Kernel regression with memory: exact where it can be computed by hand, honest about its error."""
 
 import copy
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -8,11 +9,12 @@ import pytest
 import torch
 
 from surgisoft.errors import InputError
-from surgisoft.surrogate import kernel_fit
+from surgisoft.surrogate import kernel_fit, prior_mean
 from surgisoft.surrogate.fit import FitConfig, fit
 from surgisoft.surrogate.history import pack
 from surgisoft.surrogate.interval import coverage_of
 from surgisoft.surrogate.networks import HawNN, KernelArm
+from surgisoft.surrogate.training import Data
 from tests.surrogate.test_fit import NOISE, lagging, rmse, runs
 from tests.surrogate.truth import SPEC
 
@@ -26,10 +28,14 @@ def lagged(seeds, rows: int = 200):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def few_landmarks():
-    """Fewer landmarks than by default: the fits of this file are short."""
+def short_fits():
+    """Fewer landmarks, folds and trials than by default: the fits of this file are short."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kernel_fit, "LANDMARKS", 150)
+        patch.setattr(kernel_fit, "FOLDS", 3)
+        patch.setattr(prior_mean, "MOST_ROWS", 300)
+        patch.setattr(kernel_fit, "FOLD_ITERATIONS", 8)
+        patch.setattr(kernel_fit, "WIDTHS", (1.0, 2.0))
         yield
 
 
@@ -68,8 +74,8 @@ def test_without_memory_it_is_the_mean_of_a_gaussian_process():
     result = fit(train, None, SPEC, KERNEL)
     network = result.model.network
     assert network.landmarks == 150
-    words = result.stages[0].settings.replace(",", "").split()
-    width, ridge = float(words[1]), float(words[-1])
+    settings = re.fullmatch(r"width (\S+), .* ridge (\S+)", result.stages[0].settings)
+    width, ridge = map(float, settings.groups())
     low, high = np.array(SPEC.low), np.array(SPEC.high)
 
     def scaled(pressure):
@@ -133,6 +139,20 @@ def test_auto_takes_the_network_or_the_kernel_by_held_out_error():
     other = fit(lagged(range(6), 150), mirrored, SPEC, small)
     assert isinstance(other.model.network, HawNN), "less wrong there, for it learned less"
     assert not other.stages[-1].kept
+
+
+def test_a_run_takes_no_part_in_its_own_left_out_prediction():
+    """One run bends the other way: arcs and weights of the others cannot know."""
+    train = lagged(range(6), 100)
+    turned = train.key_points.clone()
+    turned[3, ..., :2] *= -1.0
+    data = Data.split(replace(train, key_points=turned), None, 0)
+    found = kernel_fit.fit_kernel(data, SPEC, True, 0, lambda *of: None)
+    mine = torch.arange(6).repeat_interleave(100) == 3
+    mirror = torch.tensor([-1.0, -1.0, 1.0])
+    off = (found.predicted_mm - found.measured_mm)[mine].square().sum(-1).mean()
+    as_others = (found.predicted_mm - mirror * found.measured_mm)[mine].square().sum(-1).mean()
+    assert as_others < 0.2 * off
 
 
 def test_effects_are_left_to_amend():

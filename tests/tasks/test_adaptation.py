@@ -58,15 +58,16 @@ def test_without_transients_it_is_bayesian_linear_regression(model):
     memory, _ = learned(estimator, off, at)
     spec = model.spec
     rest, low, high = (np.array(each) for each in (spec.rest, spec.low, spec.high))
-    inputs = np.ones((40, 4))
-    inputs[:, 1:] = (at[:, 0].numpy() - rest) / np.maximum(high - rest, rest - low)
+    load = (at[:, 0].numpy() - rest) / np.maximum(high - rest, rest - low)
+    products = [load[:, a] * load[:, b] for a in range(3) for b in range(a, 3)]
+    inputs = np.column_stack((np.ones(40), load, *products))
     shapes = estimator.shapes.double().numpy()
     seen = off.double().reshape(40, 15).numpy() @ shapes
-    prior = estimator.deviation.double().numpy()[:, :4] ** 2
+    prior = estimator.deviation.double().numpy()[:, :10] ** 2
     for shape in range(15):
         precision = inputs.T @ inputs / 0.08**2 + np.diag(1.0 / prior[shape])
         expected = np.linalg.solve(precision, inputs.T @ seen[:, shape] / 0.08**2)
-        found = memory.mean[0, shape, :4].double().numpy() * np.sqrt(prior[shape])
+        found = memory.mean[0, shape, :10].double().numpy() * np.sqrt(prior[shape])
         np.testing.assert_allclose(found, expected, atol=2e-3)
 
 

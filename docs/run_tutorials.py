@@ -1,7 +1,8 @@
 """Run the code of the documentation: tutorials with all their blocks, guides with their Python.
 
     python docs/run_tutorials.py [NAME...]           run pages; stop at the first block that fails
-    python docs/run_tutorials.py --write [NAME...]   also renew their outputs and pictures
+    python docs/run_tutorials.py --write [NAME...]   also renew their outputs, pictures, notebooks
+    python docs/run_tutorials.py --notebooks         write the notebooks of the pages as they are
 
 A tutorial (docs/tutorials) runs in an empty folder of its own. What a block is, its fence says:
 
@@ -14,14 +15,19 @@ A tutorial (docs/tutorials) runs in an empty folder of its own. What a block is,
 A picture of a page, `![...](images/NAME.png)`, is the file NAME.png that its blocks left in the
 folder; --write copies it, at most `MOST_PIXELS` wide.
 
+Each tutorial is a Jupyter notebook too, NAME.ipynb beside it, made of the page with the outputs and
+pictures that its run left: `bash` is a cell with `%%bash`, a file one with `%%writefile`.
+
 A guide (README.md and docs) runs in a folder with a recording, a model, a trained policy and the
 scenes; a block that begins with `# NAME.py` is also that file. Its lines for the shell are parsed
 by tests/test_docs.py: commands and options exist.
 """
 
+import base64
 import contextlib
 import importlib.util
 import io
+import json
 import os
 import re
 import shutil
@@ -43,16 +49,33 @@ NOT_RUN = {
 }
 """Guides whose Python cannot run without a robot, and what runs in their place."""
 PICTURE = re.compile(r"\]\(images/([\w-]+\.png)\)")
+SHOWN = re.compile(r"^!\[(?P<what>[^\]]*)\]\(images/(?P<name>[\w-]+\.png)\)\n", re.M)
+LINK = "[This page as a Jupyter notebook](NAME.ipynb), with the same outputs.\n\n"
+"""Line of a tutorial that its notebook leaves out; NAME is the page's."""
+FIRST_CELL = """# Files go into a new folder; commands are those of this notebook's Python.
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+%cd -q {tempfile.mkdtemp(prefix="surgisoft-")}"""
+"""First cell of code of a notebook."""
 PYTHON = re.compile(r"^(?P<indent> *)```python\n(?P<body>.*?)^ *```", re.S | re.M)
 BLOCK = re.compile(r"^```(?P<info>[^\n]*)\n(?P<body>.*?)^```\n", re.S | re.M)
 
 
 def main(arguments: list[str]) -> int:
     """Run the pages that are named, or all of them."""
-    unknown = [one for one in arguments if one.startswith("-") and one != "--write"]
+    known = ("--write", "--notebooks")
+    unknown = [one for one in arguments if one.startswith("-") and one not in known]
     if unknown:
         print(__doc__)
         return 0 if unknown[0] in ("-h", "--help") else 2
+    if "--notebooks" in arguments:
+        for page in tutorials():
+            write_notebook(page)
+        return 0
     write = "--write" in arguments
     names = [name.removesuffix(".md") for name in arguments if not name.startswith("-")]
     for guide in guides():
@@ -63,9 +86,8 @@ def main(arguments: list[str]) -> int:
                 prepare(Path(folder))
                 run_guide(guide.read_text(), Path(folder), guide.name)
             print(f"{name}: {time.perf_counter() - began:.0f} s")
-    pages = [PAGES / f"{name}.md" for name in names] or sorted(PAGES.glob("*.md"))
-    for page in filter(Path.is_file, pages):
-        if page.name == "index.md":
+    for page in tutorials():
+        if names and page.stem not in names:
             continue
         began = time.perf_counter()
         with tempfile.TemporaryDirectory(prefix="tutorial-") as folder:
@@ -80,8 +102,92 @@ def main(arguments: list[str]) -> int:
                     keep(made, PAGES / "images" / name)
         if write:
             page.write_text(text)
+            write_notebook(page)
         print(f"{page.name}: {time.perf_counter() - began:.0f} s")
     return 0
+
+
+def tutorials() -> list[Path]:
+    """The pages whose blocks are all run."""
+    return [page for page in sorted(PAGES.glob("*.md")) if page.name != "index.md"]
+
+
+def write_notebook(page: Path) -> None:
+    """Write the notebook of a page beside it."""
+    whole = json.dumps(notebook(page.read_text(), page.stem), indent=1, ensure_ascii=False)
+    page.with_suffix(".ipynb").write_text(whole + "\n")
+
+
+def notebook(text: str, name: str) -> dict:
+    """A tutorial as a Jupyter notebook (nbformat 4.5), with the outputs that the page shows."""
+    cells: list[dict] = []
+
+    def cell(kind: str, source: str) -> None:
+        one = {"cell_type": kind, "id": f"{name}-{len(cells)}", "metadata": {}}
+        if kind == "code":
+            count = 1 + sum(other["cell_type"] == "code" for other in cells)
+            one |= {"execution_count": count, "outputs": []}
+        cells.append(one | {"source": source.rstrip("\n").splitlines(keepends=True)})
+
+    def prose(part: str) -> None:
+        at = 0
+        for picture in SHOWN.finditer(part):
+            words(part[at : picture.start()])
+            at = picture.end()
+            shown = picture["name"]
+            cell(
+                "code",
+                f'# {picture["what"]}\nfrom IPython.display import Image\n\nImage("{shown}")',
+            )
+            data = base64.b64encode((PAGES / "images" / shown).read_bytes()).decode()
+            plain = "<IPython.core.display.Image object>"
+            cells[-1]["outputs"] = [
+                {
+                    "output_type": "execute_result",
+                    "execution_count": cells[-1]["execution_count"],
+                    "data": {"image/png": data, "text/plain": [plain]},
+                    "metadata": {},
+                }
+            ]
+        words(part[at:])
+
+    def words(part: str) -> None:
+        if part.strip():
+            cell("markdown", part.strip("\n"))
+
+    at, ran = 0, None  # ran: the cell that printed what the next block of text holds
+    text = text.replace(LINK.replace("NAME", name), "")
+    for block in BLOCK.finditer(text):
+        prose(text[at : block.start()])
+        at = block.end()
+        info, body = block["info"], block["body"]
+        language = info.split(" ")[0]
+        title = re.search(r'title="([^"]+)"', info)
+        needs = re.search(r'needs="([^"]+)"', info)
+        if not any(one["cell_type"] == "code" for one in cells):
+            cell("code", FIRST_CELL)
+        if language == "text" and ran is not None:
+            lines = body.splitlines(keepends=True)
+            ran["outputs"] = [{"output_type": "stream", "name": "stdout", "text": lines}]
+        elif title:
+            cell("code", f"%%writefile {title[1]}\n{body}")
+            lines = [f"Writing {title[1]}\n"]
+            cells[-1]["outputs"] = [{"output_type": "stream", "name": "stdout", "text": lines}]
+        elif language == "bash":
+            cell("code", f"%%bash\nset -euo pipefail\n{body}")
+        elif language == "python":
+            cell("code", (f"# needs {needs[1].replace(',', ', ')}\n" if needs else "") + body)
+        else:
+            words(block[0])
+        ran = cells[-1] if language in ("bash", "python") and not title else None
+    prose(text[at:])
+    python = {"display_name": "Python 3", "language": "python", "name": "python3"}
+    return {
+        "cells": cells,
+        "metadata": {"kernelspec": python, "language_info": {"name": "python"}},
+        "nbformat": 4,
+        "nbformat_minor": 5,
+    }
 
 
 def guides() -> list[Path]:

@@ -1,6 +1,8 @@
 """The tutorials: their runner runs blocks in order, and their pictures stay small."""
 
+import base64
 import importlib.util
+import json
 from pathlib import Path
 
 import pytest
@@ -80,6 +82,43 @@ def test_every_output_of_a_tutorial_was_written():
     for page in (DOCS / "tutorials").glob("*.md"):
         for block in tutorials.BLOCK.finditer(page.read_text()):
             assert block["info"] != "text" or block["body"].strip(), page.name
+
+
+def test_a_notebook_has_the_cells_of_its_page_and_their_outputs():
+    cells = tutorials.notebook(PAGE.replace("old", "4"), "page")["cells"]
+    code = ["".join(one["source"]) for one in cells if one["cell_type"] == "code"]
+    assert code[1:] == [
+        "%%writefile a.toml\nn = 3",
+        'import tomllib\n\nn = tomllib.loads(open("a.toml").read())["n"]',
+        "print(n + 1)",
+        "%%bash\nset -euo pipefail\ncat a.toml | sed -n 1,1p\nsurgisoft --version | cut -c1-9",
+        "# needs json, no_such_library\nraise ValueError",
+    ]
+    printed = {
+        "".join(one["source"]): "".join(one["outputs"][0]["text"])
+        for one in cells
+        if one["cell_type"] == "code" and one["outputs"]
+    }
+    assert printed["print(n + 1)"] == "4\n"
+    words = ["".join(one["source"]) for one in cells if one["cell_type"] == "markdown"]
+    assert words == ["# A page", "Words."]
+
+
+@pytest.mark.parametrize("page", tutorials.tutorials(), ids=lambda page: page.stem)
+def test_the_notebook_of_a_tutorial_is_that_of_its_page(page):
+    """Also: each picture that the page shows is in the notebook as it is in the folder."""
+    text = page.read_text()
+    assert tutorials.LINK.replace("NAME", page.stem) in text
+    made = json.loads(page.with_suffix(".ipynb").read_text())
+    assert made == tutorials.notebook(text, page.stem), "python docs/run_tutorials.py --notebooks"
+    drawn = [
+        base64.b64decode(output["data"]["image/png"])
+        for cell in made["cells"]
+        for output in cell.get("outputs", [])
+        if "data" in output
+    ]
+    shown = tutorials.PICTURE.findall(text)
+    assert drawn == [(DOCS / "tutorials" / "images" / name).read_bytes() for name in shown]
 
 
 GUIDE = """# A guide

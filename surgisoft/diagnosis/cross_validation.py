@@ -156,16 +156,21 @@ class Split:
         return answer
 
     def away(self, field: np.ndarray, shrunk: np.ndarray, number: int) -> np.ndarray:
-        """(s, n, 3, C) what a fold's static fit leaves of a field on the rows that it holds out."""
+        """(s, n, 3, C) what a fold's static fit leaves of a field (s, n, 3, C) on the rows that the
+        fold holds out."""
         rows = self.held[number]
-        answer = field[rows]
+        answer = np.empty_like(field)
         for place, basis in enumerate(self.bases[number]):
             if (number, place) not in self.rotated:
                 self.rotated[number, place] = self.features[rows] @ basis.vectors
             own = self.rotated[number, place]
             at = _at_once(basis.points, field.shape[1])
             part = own @ shrunk[:, at].reshape(len(shrunk), -1)
-            answer[:, at] -= part.reshape(len(rows), len(basis.points), *field.shape[2:])
+            part = part.reshape(len(rows), len(basis.points), *field.shape[2:])
+            if len(basis.points) == field.shape[1]:
+                answer = np.subtract(field, part, out=part)
+            else:
+                answer[:, at] = field[:, at] - part
         answer[~self.seen[rows]] = 0.0
         return answer
 
@@ -180,7 +185,7 @@ class CrossValidation:
     grams: np.ndarray
     """(L, folds, 1 + K, 1 + K) products of them over the fitted rows, static part out."""
     held_out: np.ndarray
-    """(L, B, 1 + K, 1 + K) the same of what the static part leaves on each held-out block."""
+    """(L, 1 + K, 1 + K, B) the same of what the static part leaves on each held-out block."""
     turned: list[np.ndarray]
     """For each fold (F, n, 3, 1 + K) products of the static part's basis and `fields`."""
     cache: dict = field(default_factory=dict)
@@ -207,14 +212,13 @@ class CrossValidation:
         turned = self.split.turned(more)
         whole = [np.concatenate(pair, axis=3) for pair in zip(self.turned, turned, strict=True)]
         beside = _products(self.split, both, whole, more, turned)
-        grams, held_out = (
-            _bordered(*pair) for pair in zip((self.grams, self.held_out), beside, strict=True)
-        )
+        grams = _bordered(self.grams, beside[0], axis=2)
+        held_out = _bordered(self.held_out, beside[1], axis=1)
         return CrossValidation(self.split, both, grams, held_out, whole, dict(self.cache))
 
     def level_losses(self) -> np.ndarray:
         """(L, B) held-out sum of squared distances, mm^2, of the features alone at each ridge."""
-        return self.held_out[:, :, 0, 0].astype(float)
+        return self.held_out[:, 0, 0].astype(float)
 
     @property
     def sensitivities(self) -> int:
@@ -266,21 +270,30 @@ def _masked(split: Split, sensitivities: np.ndarray) -> np.ndarray:
 def _products(split: Split, a, turned_a, b, turned_b) -> tuple[np.ndarray, np.ndarray]:
     """(grams, held_out) of CrossValidation from columns of two fields (rows, n, 3, A or B)."""
     levels, folds, size = len(split.ridges), len(split.bases), (a.shape[3], b.shape[3])
-    parts = np.array([_product(a[rows], b[rows]) for rows in split.held], float)
-    grams = np.broadcast_to(parts.sum(axis=0) - parts, (levels, folds, *size)).copy()
-    held_out = np.empty((levels, len(split.fold), *size), np.float32)
-    for number, rows in enumerate(split.held):
-        block = split.block[rows]
-        owned = [(one, np.flatnonzero(block == one)) for one in np.unique(block)]
-        for level in range(levels):
+    parts = np.empty((folds, *size))
+    grams = np.empty((levels, folds, *size))
+    held_out = np.empty((levels, *size, len(split.fold)), np.float32)
+    by_block = np.empty((len(split.fold), *size), np.float32)
+    for level in range(levels):
+        for number, rows in enumerate(split.held):
+            own_b = b[rows]
+            own_a = own_b if a is b else a[rows]
+            if not level:
+                parts[number] = _product(own_a, own_b)
             mine = split.shrunk(turned_b[number], number, level)
-            grams[level, number] -= _product(turned_a[number], mine)
-            right = split.away(b, mine, number)
+            grams[level, number] = _product(turned_a[number], mine)
+            right = split.away(own_b, mine, number)
             left = right
             if a is not b:
-                left = split.away(a, split.shrunk(turned_a[number], number, level), number)
-            for one, own in owned:
-                held_out[level, one] = _product(left[own], right[own])
+                left = split.away(own_a, split.shrunk(turned_a[number], number, level), number)
+            block = split.block[rows]
+            for one in np.unique(block):
+                own = _at_once(np.flatnonzero(block == one))
+                by_block[one] = _product(left[own], right[own])
+        # A set of columns is then looked up in lines of all blocks, which the cache holds.
+        lines = held_out[level].reshape(-1, len(by_block))
+        _transpose(by_block.reshape(len(by_block), -1), lines)
+    np.subtract(parts.sum(axis=0) - parts, grams, out=grams)
     return grams, held_out
 
 
@@ -299,42 +312,56 @@ def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a.reshape(-1, a.shape[-1]).T @ b.reshape(-1, b.shape[-1])
 
 
-def _bordered(inner: np.ndarray, border: np.ndarray) -> np.ndarray:
-    """(..., C, C) symmetric matrices from (..., A, A) and their last columns (..., C, C - A)."""
-    first, size = inner.shape[-1], border.shape[-2]
-    answer = np.empty((*inner.shape[:-2], size, size), inner.dtype)
-    answer[..., :first, :first] = inner
-    answer[..., first:] = border
-    answer[..., first:, :first] = np.swapaxes(border[..., :first, :], -1, -2)
+def _bordered(inner: np.ndarray, border: np.ndarray, axis: int) -> np.ndarray:
+    """Symmetric matrices (C, C) from (A, A) and their last columns (C, C - A).
+
+    axis: that of the matrices' rows; that of their columns follows.
+    """
+    lead, first, size = (slice(None),) * axis, inner.shape[axis], border.shape[axis]
+    answer = np.empty((*inner.shape[:axis], size, size, *inner.shape[axis + 2 :]), inner.dtype)
+    answer[(*lead, slice(first), slice(first))] = inner
+    answer[(*lead, slice(None), slice(first, None))] = border
+    corner = np.swapaxes(border[(*lead, slice(first))], axis, axis + 1)
+    answer[(*lead, slice(first, None), slice(first))] = corner
     return answer
+
+
+@compiled
+def _transpose(matrix, out):
+    """Write a matrix (R, C) into out (C, R), in strips of 16 rows: a line of the cache each."""
+    rows, columns = matrix.shape
+    for first in range(0, rows, 16):
+        last = min(first + 16, rows)
+        for column in range(columns):
+            for row in range(first, last):
+                out[column, row] = matrix[row, column]
 
 
 @compiled
 def _sum_squares(held_out, rows, amplitudes, fold, losses):
     """Held-out sums of squares into losses (L, r, B), mm^2: x' G x with x = (1, -amplitudes).
 
-    held_out (L, B, C, C) products G of all columns; rows (1 + k,) those that are looked at;
+    held_out (L, C, C, B) products G of all columns; rows (1 + k,) those that are looked at;
     amplitudes (L, r, folds, k); fold (B,) of each block.
     """
     levels, ridges, blocks = losses.shape
     size = len(rows)
-    part, mix = np.empty((size, size)), np.empty(size)
-    mix[0] = 1.0
+    mix, along = np.ones((size, blocks)), np.empty(blocks)
     for level in range(levels):
-        for block in range(blocks):
+        for ridge in range(ridges):
+            total = losses[level, ridge]
+            for i in range(1, size):
+                for block in range(blocks):
+                    mix[i, block] = -amplitudes[level, ridge, fold[block], i - 1]
+            total[:] = 0.0
             for i in range(size):
+                along[:] = 0.0
                 for j in range(size):
-                    part[i, j] = held_out[level, block, rows[i], rows[j]]
-            for ridge in range(ridges):
-                for i in range(1, size):
-                    mix[i] = -amplitudes[level, ridge, fold[block], i - 1]
-                total = 0.0
-                for i in range(size):
-                    along = 0.0
-                    for j in range(size):
-                        along += part[i, j] * mix[j]
-                    total += mix[i] * along
-                losses[level, ridge, block] = total
+                    product = held_out[level, rows[i], rows[j]]
+                    for block in range(blocks):
+                        along[block] += product[block] * mix[j, block]
+                for block in range(blocks):
+                    total[block] += mix[i, block] * along[block]
 
 
 def _amplitudes(gram: np.ndarray) -> np.ndarray:

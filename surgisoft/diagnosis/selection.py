@@ -109,7 +109,7 @@ class ModelSelection:
     options: dict[str, list[Option]]
     """Forms of each effect."""
     sensitivities: np.ndarray
-    """(S, n, 3, K) all sensitivities, mm."""
+    """(S, n, 3, K) all sensitivities, mm, in the candidates' precision."""
     floor: np.ndarray
     """(B,) sum of squared noise in each block, mm^2."""
     fitted: dict = field(default_factory=dict)
@@ -118,9 +118,8 @@ class ModelSelection:
     @classmethod
     def of(cls, problem: Problem, candidates: list[Candidate]) -> "ModelSelection":
         """Prepare the selection; afterwards every set of effects is cheap to try."""
-        sensitivities = np.concatenate(
-            [np.zeros((*problem.residual.shape, 0)), *(c.sensitivities for c in candidates)], axis=3
-        )
+        nothing = np.zeros((*problem.residual.shape, 0), np.float32)
+        sensitivities = np.concatenate([nothing, *(c.sensitivities for c in candidates)], axis=3)
         validation = CrossValidation.on(split_of(problem), sensitivities)
         options: dict[str, list[Option]] = {}
         for option in _options_of(candidates):
@@ -440,16 +439,29 @@ def _by_time(selection: ModelSelection, part: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """One effect, or two that may be missing together."""
+    """One effect, or two that may be missing together; its tests are made when they are read."""
 
+    selection: ModelSelection
+    """The candidates that it was selected from."""
     scores: tuple[Score, ...]
     """The effects, the one that would be missed most first, each on top of those before it."""
-    relaxed: RelaxedFit
-    """The lack of fit of these effects."""
-    beside: Score | None
-    """The last effect beside the relaxed forms of those before it; None for a single effect."""
-    instead: tuple[Score | None, ...]
-    """For each of two effects the best other one in its place; None where there is none."""
+
+    @cached_property
+    def relaxed(self) -> RelaxedFit:
+        """The lack of fit of these effects."""
+        return relaxed_fit(self.selection, self.scores)
+
+    @cached_property
+    def beside(self) -> Score | None:
+        """The last effect beside the relaxed forms of those before it; None for a single effect."""
+        if len(self.scores) == 1:
+            return None
+        return beside_relaxed(self.selection, self.scores[:-1], self.scores[-1])
+
+    @cached_property
+    def instead(self) -> tuple[Score | None, ...]:
+        """For each of two effects the best other one in its place; None where there is none."""
+        return _instead(self.selection, self.scores) if len(self.scores) > 1 else ()
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -479,9 +491,7 @@ def propose(selection: ModelSelection, first: list[Score]) -> tuple[Proposal, ..
         if answer and frozenset(score.effect for score in found) == before:
             break
         named = found
-        beside = beside_relaxed(selection, named[:-1], named[-1]) if len(named) > 1 else None
-        instead = _instead(selection, named) if len(named) > 1 else ()
-        answer.append(Proposal(tuple(named), relaxed_fit(selection, named), beside, instead))
+        answer.append(Proposal(selection, tuple(named)))
         following = selection.scores(chosen_by(named), tuple(s.effect for s in named))
     return tuple(answer)
 
@@ -491,7 +501,7 @@ def _worth_a_look(score: Score) -> bool:
     return score.p_value <= SEARCH.p_value or score.gain >= SEARCH.large_gain
 
 
-def _instead(selection: ModelSelection, named: list[Score]) -> tuple[Score | None, ...]:
+def _instead(selection: ModelSelection, named: Sequence[Score]) -> tuple[Score | None, ...]:
     """For each effect the best other one beside those that stay."""
     answer = []
     for score in named:

@@ -97,6 +97,7 @@ def open_results(spec: Experiment, folder: Path, resume: bool = False, force: bo
                 f"{folder}: holds another experiment ({folder / FILE} differs); choose another "
                 "folder, or --force to begin anew"
             )
+        _check_scene(spec, folder)
         return
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         if not there:
@@ -117,6 +118,18 @@ def open_results(spec: Experiment, folder: Path, resume: bool = False, force: bo
         (fresh / "rows").mkdir()
         write_json(fresh / "versions.json", about)
         save_experiment(spec, fresh / FILE)
+
+
+def _check_scene(spec: Experiment, folder: Path) -> None:
+    """Raise an InputError where the scene is not the one that the results began with."""
+    file = folder / "versions.json"
+    about = read_json(file) if file.is_file() else None
+    began = about.get("scene_hash") if isinstance(about, dict) else None
+    if spec.in_scene and began not in (None, scene_of(spec, settings(spec)[0]).content_hash):
+        raise InputError(
+            f"{folder}: its scene '{spec.scene}' has changed since the results began (by {file}); "
+            "bring that scene back, or --force to begin anew"
+        )
 
 
 def check_playable(spec: Experiment) -> None:

@@ -280,24 +280,37 @@ def task_config(of: TaskSpec, table: dict, where: Where) -> Any:
 
 
 def save_experiment(spec: Experiment, path: Path) -> None:
-    """Write the exact configuration, with every default; loading it gives an equal one."""
+    """Write the exact configuration, with every default; loading it gives an equal one.
+
+    What the package brings along is written by its name, which holds in every installation.
+    """
+    folder = path.parent.resolve()
     table = _without_none(to_table(spec))
     for name in ("scene", "arm"):
         table["task"].pop(name, None)
-    folder = path.parent.resolve()
-    table["scene"] = os.path.relpath(spec.scene, folder) if spec.scene else ""
+    table["scene"] = _from_folder(spec.scene, folder) if spec.scene else ""
     table["phases"] = [
         {name: value for name, value in phase.items() if name != "arms"} | dict(phase["arms"])
         for phase in table["phases"]
     ]
     for driver in table["drivers"]:
         if driver["schedule"]:
-            driver["schedule"] = os.path.relpath(driver["schedule"], folder)
+            driver["schedule"] = _from_folder(driver["schedule"], folder)
     for case in table["cases"]:
         for name in ("policy", "arm"):
             if case[name] not in ("", "default", SCRIPTED, NOMINAL):
-                case[name] = os.path.relpath(case[name], folder)
+                case[name] = _from_folder(case[name], folder)
     write_toml(path, table)
+
+
+def _from_folder(path: str, folder: Path) -> str:
+    """A path as a file in the folder names it: a packaged one by its name."""
+    if _packaged(Path(path).name) == Path(path):
+        return Path(path).name
+    try:
+        return os.path.relpath(path, folder)
+    except ValueError:  # on Windows: another drive
+        return path
 
 
 def _without_none(value: Any) -> Any:
@@ -306,10 +319,17 @@ def _without_none(value: Any) -> Any:
     return [_without_none(part) for part in value] if isinstance(value, list) else value
 
 
-def _packaged(name: str) -> Path | None:
-    """The scene or the training run that the package brings along under a name."""
+def _packaged(text: str) -> Path | None:
+    """The scene or the training run that the package brings along.
+
+    text: its name, or a path to it in an installation of the package that is no longer there.
+    """
+    path = Path(text)
+    places = (("surgisoft", "assets", PACKAGED.name), ("surgisoft", SCENES.name))
+    if len(path.parts) > 1 and not any(path.parts[-1 - len(at) : -1] == at for at in places):
+        return None
     files = [*PACKAGED.glob("*/config.json"), *SCENES.glob("*/scene.toml")]
-    return {file.parent.name: file.parent for file in files}.get(name)
+    return {file.parent.name: file.parent for file in files}.get(path.name)
 
 
 def _absolute(spec: Experiment, where: Where) -> Experiment:

@@ -43,7 +43,8 @@ def new_recording(
         recording = rr.RecordingStream(application, recording_id=identity, send_properties=False)
         content = recording.memory_recording()
         with _ended_blueprint(blueprint):
-            recording.send_blueprint(blueprint, make_active=False)
+            # Active, not only the default: a browser opens the recording before it has the layout.
+            recording.send_blueprint(blueprint, make_active=True)
         yield recording
         fresh.write_bytes(content.drain_as_bytes())
         recording.disconnect()

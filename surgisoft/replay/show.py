@@ -10,6 +10,7 @@ from surgisoft.replay.contents import TIME, contents
 from surgisoft.replay.episode_view import Replay, layout_names, write_replay
 from surgisoft.replay.recording import SUFFIX
 from surgisoft.replay.viewer import (
+    NotebookView,
     check_view,
     open_viewer,
     parse_size,
@@ -68,6 +69,8 @@ def moment(recording: Path, time_s: float | None) -> tuple[str, float] | None:
 
 WINDOW = "1600x1000"
 """Default size of the window of a screenshot, in points."""
+FRAME = "1200x750"
+"""Default size of the frame in a notebook, in points."""
 
 
 def open_replay(
@@ -76,13 +79,14 @@ def open_replay(
     save: str | Path | None = None,
     screenshot: str | Path | None = None,
     web: bool = False,
+    notebook: bool = False,
     port: int | None = None,
-    size: str = WINDOW,
+    size: str | None = None,
     time_s: float | None = None,
     view: str | None = None,
     progress: Progress = silent,
     on_address: Callable[[str], None] = print,
-) -> Replay | None:
+) -> Replay | NotebookView | None:
     """Open an episode in the Rerun viewer: arms, beam, organ, endoscope, plots, events.
 
     Positions are in mm in the world frame, times in s. Raises InputError where there is no replay,
@@ -93,11 +97,12 @@ def open_replay(
     .png file instead, at `time_s` (default: two thirds of the episode), of one `view` or of all,
     from a window of `size`. web: serve the replay to a browser on this machine; `on_address` is
     called with the address, and `port` fixes that of its page and, one above, that of its data.
+    notebook: return the viewer as a frame of `size` that Jupyter shows below the cell.
     """
-    window, found = parse_size(size), find_replay(what)
-    if sum((web, screenshot is not None, save is not None)) > 1:
-        raise InputError("expected at most one of --web, --screenshot and --save")
-    if port is not None and not web:
+    window, found = parse_size(size or (FRAME if notebook else WINDOW)), find_replay(what)
+    if sum((web, notebook, screenshot is not None, save is not None)) > 1:
+        raise InputError("expected at most one of --web, --screenshot and --save (and notebook)")
+    if port is not None and not (web or notebook):
         raise InputError("--port applies to a browser only: give --web too")
     if screenshot is None and (time_s is not None or view is not None):
         raise InputError("--time and --view apply to a picture only: give --screenshot too")
@@ -111,6 +116,8 @@ def open_replay(
         if screenshot is not None:
             at = moment(recording, time_s)
             take_screenshot(recording, Path(screenshot), view, at, window)
+        elif notebook:
+            return NotebookView(recording, port, window)
         elif web:
             serve_viewer(recording, on_address, port)
         else:

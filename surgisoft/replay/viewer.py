@@ -3,8 +3,10 @@
 Screenshots need no display: the native viewer draws them with a Vulkan driver in software.
 """
 
+import atexit
 import contextlib
 import ctypes
+import html
 import io
 import os
 import signal
@@ -114,10 +116,9 @@ def open_viewer(recording: Path) -> None:
             )
 
 
-def serve_viewer(
-    recording: Path, on_address: Callable[[str], None], port: int | None = None
-) -> None:
-    """Serve viewer and recording to browsers on this machine until interrupted.
+@contextlib.contextmanager
+def served(recording: Path, port: int | None = None) -> Iterator[tuple[subprocess.Popen, str]]:
+    """Serve viewer and recording on this machine until the block ends: its process and address.
 
     port: that of the page, and the next one is that of the data; None: two free ones. An InputError
     where one of them is in use. The recording is sent to the running server: as an argument of the
@@ -135,9 +136,42 @@ def serve_viewer(
         stream.log_file_from_path(recording)
         stream.flush()
         stream.disconnect()
-        on_address(web_address(page, data))
+        yield viewer, web_address(page, data)
+
+
+def serve_viewer(
+    recording: Path, on_address: Callable[[str], None], port: int | None = None
+) -> None:
+    """Serve viewer and recording to browsers on this machine until interrupted; see `served`."""
+    with served(recording, port) as (viewer, address):
+        on_address(address)
         with contextlib.suppress(KeyboardInterrupt):
             viewer.wait()
+
+
+class NotebookView:
+    """The viewer in a frame below a notebook's cell, served until `close` or the kernel's end."""
+
+    def __init__(self, recording: Path, port: int | None, size: tuple[int, int]):
+        self.size = size
+        self._server = contextlib.ExitStack()
+        self.address = self._server.enter_context(served(recording, port))[1]
+        atexit.register(self.close)
+
+    def _repr_html_(self) -> str:
+        """The frame: as wide as the cell, at most the given width."""
+        width, height = self.size
+        style = f"width: 100%; max-width: {width}px; height: {height}px; border: 0"
+        address = html.escape(self.address)
+        return f'<iframe src="{address}" title="Replay" style="{style}" allowfullscreen></iframe>'
+
+    def __repr__(self) -> str:
+        return f"replay at {self.address}; close() ends it"
+
+    def close(self) -> None:
+        """End the viewer."""
+        atexit.unregister(self.close)
+        self._server.close()
 
 
 def _check_free(port: int) -> None:

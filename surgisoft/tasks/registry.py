@@ -49,6 +49,11 @@ TASKS: dict[str, TaskSpec] = {
 """Every task by name."""
 MOST_STEPS = 10_000_000
 """Most steps of an episode: eleven days at 0.1 s."""
+MOST_COUNT = 1_000
+"""Largest count in a task's configuration, such as the points of a centreline: far above any in
+use; a damaged file that claims more would take memory or minutes."""
+BOUNDED_ELSEWHERE = ("loops", "scene")
+"""Fields of a configuration that `MOST_COUNT` is not for: loops are bounded by the steps."""
 
 
 GROUP = "surgisoft.tasks"
@@ -97,9 +102,12 @@ def _loaded(entry: EntryPoint) -> TaskSpec:
 def make_task(name: str, config: Any = None, device: str | torch.device = "cpu") -> DocumentedTask:
     """Build the named task; without a config with its default one.
 
-    Raises InputError for an episode of more than `MOST_STEPS` steps.
+    Raises InputError for an episode of no step or of more than `MOST_STEPS`, and for a count in the
+    configuration of one of the package's tasks above `MOST_COUNT`.
     """
     spec = spec_of(name)
+    if name in TASKS:
+        _check_counts(name, spec.config if config is None else config)
     try:
         task = spec.build(spec.config if config is None else config, device)
         steps = task.steps
@@ -112,7 +120,24 @@ def make_task(name: str, config: Any = None, device: str | torch.device = "cpu")
             f"{name}: an episode of more than {MOST_STEPS:,} steps; expected shorter times, fewer "
             "loops or a longer dt_s in its configuration"
         )
+    if steps < 1:
+        raise InputError(
+            f"{name}: an episode of no step; expected longer times or a shorter dt_s in its "
+            "configuration"
+        )
     return task
+
+
+def _check_counts(name: str, config: Any, place: str = "") -> None:
+    """Raise InputError for a count above `MOST_COUNT`; place: prefix of the fields' names."""
+    for field in [each.name for each in dataclasses.fields(config)]:
+        value = getattr(config, field)
+        if field in BOUNDED_ELSEWHERE:
+            continue
+        if dataclasses.is_dataclass(value):
+            _check_counts(name, value, f"{place}{field}.")
+        elif type(value) is int and value > MOST_COUNT:
+            raise InputError(f"{name}: {place}{field} is {value}, expected at most {MOST_COUNT:,}")
 
 
 def make_with(

@@ -7,6 +7,7 @@ import json
 import shutil
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -18,11 +19,13 @@ from surgisoft.agents.on_rig import RigConfig
 from surgisoft.cli import run
 from surgisoft.errors import InputError
 from surgisoft.experiments import run as experiment_run
+from surgisoft.experiments import spec as experiment_spec
 from surgisoft.experiments.plan import build_task, settings
 from surgisoft.experiments.results import sum_up
 from surgisoft.experiments.run import open_results, run_experiment
 from surgisoft.experiments.session import ExperimentRules, with_policy
 from surgisoft.experiments.spec import Case, load_experiment
+from surgisoft.scene.spec import PHANTOM
 from surgisoft.tasks.circle_ablation import CircleAblationConfig, success_rule
 from surgisoft.tasks.registry import spec_of
 from tests.experiments.tiny import TINY, write
@@ -90,6 +93,35 @@ def test_an_interrupted_run_goes_on_where_it_stopped(whole, tmp_path):
     run_experiment(spec, tmp_path / "r", report=lambda done, total, note: began.append(done))
     assert began[0] == 1.0
     assert _rows(tmp_path / "r") == _rows(folder)
+
+
+def test_results_go_on_in_another_installation(tmp_path, monkeypatch):
+    """What the package brings along is named, not placed; its content has to be the same."""
+    case = '[[cases]]\nname = "ours"\npolicy = "ring"\n'
+    file = write(tmp_path, TINY.replace("{scene}", "phantom_liver") + case)
+    open_results(load_experiment(file), tmp_path / "r")
+    here = load_experiment(file).scene
+    for folder in ("scenes", "assets/policies"):
+        shutil.copytree(
+            PHANTOM.parent if folder == "scenes" else experiment_spec.PACKAGED,
+            tmp_path / "other" / "surgisoft" / folder,
+        )
+    monkeypatch.setattr(experiment_spec, "SCENES", tmp_path / "other" / "surgisoft" / "scenes")
+    policies = tmp_path / "other" / "surgisoft" / "assets" / "policies"
+    monkeypatch.setattr(experiment_spec, "PACKAGED", policies)
+    there = load_experiment(file)
+    assert there.scene != here
+    open_results(there, tmp_path / "r", resume=True)
+    text = (tmp_path / "r" / "experiment.toml").read_text()
+    placed = text.replace('"ring"', '"../gone/surgisoft/assets/policies/ring"')  # as before
+    (tmp_path / "r" / "experiment.toml").write_text(placed)
+    open_results(there, tmp_path / "r", resume=True)
+    scene = Path(there.scene) / "scene.toml"
+    changed = scene.read_text().replace("roll_deg = 55.21", "roll_deg = 56.0")
+    assert changed != scene.read_text()
+    scene.write_text(changed)
+    with pytest.raises(InputError, match="has changed since the results began"):
+        open_results(load_experiment(file), tmp_path / "r", resume=True)
 
 
 def test_results_are_not_overwritten(whole, tmp_path, capsys):

@@ -1,5 +1,6 @@
 """Writing of Rerun recordings: nothing of one stays in the process behind it."""
 
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -7,6 +8,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from surgisoft.replay.recording import new_recording
+from surgisoft.replay.viewer import viewer_command
 
 TASKS = Path("/proc/self/task")
 
@@ -23,3 +25,14 @@ def threads_behind(path, number: int) -> int:
 def test_many_recordings_take_no_more_threads_than_two(tmp_path):
     threads = [threads_behind(tmp_path / "a.rrd", number) for number in range(6)]
     assert threads[-1] <= threads[1]
+
+
+def test_the_layout_is_active_and_not_only_the_default(tmp_path):
+    """A browser has opened the recording before its layout arrives, which it would then ignore."""
+    layout = rrb.Blueprint(rrb.TimeSeriesView(origin="/", name="values"))
+    with new_recording(tmp_path / "a.rrd", "test", "one", layout) as recording:
+        recording.log("a", rr.Scalars(1.0))
+    command = [viewer_command(), "rrd", "print", str(tmp_path / "a.rrd")]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    activations = [line for line in printed.splitlines() if "BlueprintActivationCommand" in line]
+    assert ["make_active: true" in line for line in activations] == [True]

@@ -1,6 +1,8 @@
 """What is drawn of a scene: tubes of the right size, the recording's content, a picture of it."""
 
 import contextlib
+import html
+import re
 import socket
 import urllib.request
 from pathlib import Path
@@ -174,6 +176,21 @@ def test_the_page_is_served_on_the_given_port(recording):
         serve_viewer(recording, look, port)
     assert told == [web_address(port, port + 1)]
     assert answers == [200, "data"]
+
+
+def test_a_notebook_shows_the_viewer_in_a_frame_until_it_is_closed(recording):
+    port = free_port()
+    frame = open_replay(recording, notebook=True, port=port, size="900x500")
+    try:
+        shown = html.unescape(re.search(r'<iframe src="([^"]+)"', frame._repr_html_())[1])
+        assert shown == web_address(port, port + 1)
+        assert "height: 500px" in frame._repr_html_()
+        with urllib.request.urlopen(shown, timeout=20) as page:
+            assert page.status == 200
+    finally:
+        frame.close()
+    with pytest.raises(ConnectionRefusedError), socket.create_connection(("127.0.0.1", port), 1.0):
+        pass
 
 
 def test_a_port_in_use_is_one_line(recording):

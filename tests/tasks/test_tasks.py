@@ -2,6 +2,7 @@
 
 import copy
 import math
+import re
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -506,4 +507,20 @@ def test_an_episode_without_end_is_one_line(change):
     """As a damaged config.json of a training run asks for it."""
     config = with_fields(config_of("track_circle"), **change)
     with pytest.raises(InputError, match="an episode of more than 10,000,000 steps"):
+        make_task("track_circle", config)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"dt_s": 1_000_000.0}, "an episode of no step; expected longer times or a shorter"),
+        ({"samples": 10**9}, "world.samples is 1000000000, expected at most 1,000"),
+        ({"history": 1001}, "world.randomisation.history is 1001"),
+        ({"preview": 10**9}, "preview is 1000000000"),
+    ],
+)
+def test_a_configuration_that_claims_too_much_is_one_line(change, message):
+    """Found by the fuzzer in damaged config.json of training runs."""
+    config = with_fields(config_of("track_circle"), **change)
+    with pytest.raises(InputError, match=f"track_circle: .*{re.escape(message)}"):
         make_task("track_circle", config)

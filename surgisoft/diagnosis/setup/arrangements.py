@@ -137,10 +137,11 @@ def _body_response(sample: Sample) -> tuple[np.ndarray, np.ndarray]:
 def _scale(sample: Sample) -> float:
     """Recorded units in one mm, from the distances between neighbouring key points, or motion."""
     recorded, rest = sample.measured()[0], sample.model.rest_mm.double().cpu().numpy()
-    if rest.shape[0] > 1:
-        links = np.linalg.norm(np.diff(recorded, axis=1), axis=2)
-        true = float(np.linalg.norm(np.diff(rest, axis=0), axis=1).sum())
-        found = float(np.nanmedian(links, axis=0).sum()) / max(true, 1e-12)
+    links = np.linalg.norm(np.diff(recorded, axis=1), axis=2)
+    seen = np.isfinite(links).any(axis=0)
+    if seen.any():
+        true = float(np.linalg.norm(np.diff(rest, axis=0), axis=1)[seen].sum())
+        found = float(np.nanmedian(links[:, seen], axis=0).sum()) / max(true, 1e-12)
     else:
         plain = Arrangement.as_recorded(sample.history.chambers)
         found = float(np.nanstd(recorded) / max(sample.predicted([plain])[0].std(), 1e-12))

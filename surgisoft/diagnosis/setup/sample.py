@@ -155,7 +155,8 @@ class Sample:
 
 
 class RowPredictions:
-    """Predicted key points of a sample's rows, mm; the network computes those that are asked for.
+    """Predicted key points of a sample's rows, mm; the network computes those that are asked for,
+    each once.
 
     Memories follow every row. A network of whole runs, and effects behind the network, which may
     remember key points, need every row computed.
@@ -163,6 +164,12 @@ class RowPredictions:
 
     def __init__(self, sample: Sample, arrangement: Arrangement):
         self._sample, self._arrangement = sample, arrangement
+        self._known: list[np.ndarray] = []
+
+    @cached_property
+    def _place(self) -> np.ndarray:
+        """(S,) place of each row among those of `_known`; -1 where it was never asked for."""
+        return np.full(self._sample.rows, -1, np.int32)
 
     @cached_property
     def whole(self) -> np.ndarray:
@@ -180,11 +187,15 @@ class RowPredictions:
         """(K, n, 3) single precision, of the rows (K,)."""
         if "whole" in vars(self) or not self._sample.model.row_wise:
             return self.whole[rows]
-        some, index = torch.from_numpy(rows), self._inputs
-        with torch.no_grad():
-            points = self._sample.model.network(index[0][some], index[1][some]).numpy()
-        points[~np.isfinite(points)] = 0.0
-        return points
+        new = np.unique(rows[self._place[rows] < 0])
+        if len(new):
+            some, inputs = torch.from_numpy(new), self._inputs
+            with torch.no_grad():
+                points = self._sample.model.network(inputs[0][some], inputs[1][some]).numpy()
+            points[~np.isfinite(points)] = 0.0
+            self._place[new] = sum(map(len, self._known)) + np.arange(len(new))
+            self._known = [np.concatenate([*self._known, points])]
+        return self._known[0][self._place[rows]]
 
 
 def sample_of(model: ArmModel, recordings: list[Recording], rows: int) -> Sample:

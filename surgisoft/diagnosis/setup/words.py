@@ -82,7 +82,8 @@ def _chambers(arrangement: Arrangement) -> SetupFault:
     if flipped:
         many = len(flipped) > 1
         parts.append(
-            f"the sign of chamber{'s' * many} {_numbers(flipped)} {'are' if many else 'is'} flipped"
+            f"the sign{'s' * many} of chamber{'s' * many} {_numbers(flipped)} "
+            f"{'are' if many else 'is'} flipped"
         )
     idle = [k for k, s in enumerate(sign) if s == 0]
     if idle:

@@ -53,14 +53,40 @@ class LinearArm:
         return torch.from_numpy(points).float()
 
 
-def sample(turned=None, unit_kPa: float = 1.0, rows: int = 500) -> Sample:
-    """A recording of the arm whose channels are wired as TRUTH says, in a turned frame."""
-    model, chambers = LinearArm(), 6.0 * walk(rows, CHAMBERS, 3)
+class TipOnly(LinearArm):
+    """The same arm, of which only the tip is seen."""
+
+    spec = Spec(key_points=1)
+    rest_mm = LinearArm.rest_mm[1:]
+
+    def __init__(self):
+        super().__init__()
+        self.gain = self.gain[:, 1:]
+
+
+def sample(
+    turned=None,
+    unit_kPa: float = 1.0,
+    rows: int = 500,
+    model=None,
+    size=6.0,
+    unit_mm: float = 1.0,
+    unseen: int | None = None,
+) -> Sample:
+    """A recording of the arm whose channels are wired as TRUTH says, in a turned frame.
+
+    size: scale of the motion of all chambers, or of each, kPa. unseen: a key point without
+    positions.
+    """
+    model, chambers = model or LinearArm(), size * walk(rows, CHAMBERS, 3)
     recorded = np.empty_like(chambers)
     for chamber, (channel, sign) in enumerate(zip(TRUTH.order, TRUTH.sign, strict=True)):
         recorded[:, channel] = sign * chambers[:, chamber] / unit_kPa
-    points = model.moved(chambers) + np.random.default_rng(0).normal(0.0, 0.05, (rows, 2, 3))
+    points = model.moved(chambers)
+    points = (points + np.random.default_rng(0).normal(0.0, 0.05, points.shape)) / unit_mm
     points = points if turned is None else points @ turned.T
+    if unseen is not None:
+        points[:, unseen] = np.nan
     t_s = STEP_S * np.arange(rows)
     history = pack(
         [torch.from_numpy(t_s)], [torch.from_numpy(recorded)], [torch.from_numpy(points)]
@@ -92,6 +118,30 @@ def test_the_wiring_of_six_chambers_is_among_the_proposals(turned, unit_kPa):
     assert len(found) == len(set(found)) < 200
     one_flipped = [each for each in found if each.factor == 1.0 and each.changes == 1]
     assert {each.sign for each in idle(CHAMBERS)} <= {each.sign for each in one_flipped}
+
+
+@pytest.mark.parametrize("model", [LinearArm(), TipOnly()])
+def test_positions_in_metres_are_compared_in_millimetres(model):
+    """The scale follows from the links between key points; of one, from how far it moves."""
+    given = sample(model=model, unit_mm=1000.0)
+    assert TRUTH in proposed(given, [tuple(range(model.spec.key_points))], [1.0])
+
+
+def test_a_key_point_that_is_never_seen_says_nothing():
+    given = sample(unseen=0, unit_mm=1000.0)
+    assert TRUTH in proposed(given, [(0, 1)], [1.0])
+
+
+def test_a_channel_that_hardly_moves_does_not_decide_where_the_others_belong():
+    """Its response is noise; unweighted, the noise is as large as a response."""
+    size = np.array([6.0, 6.0, 6.0, 6.0, 6.0, 0.003])
+    found = proposed(sample(size=size, rows=300), [(0, 1)], [1.0])
+    known = range(CHAMBERS - 1)
+
+    def right(each: Arrangement) -> bool:
+        return all((each.order[k], each.sign[k]) == (TRUTH.order[k], TRUTH.sign[k]) for k in known)
+
+    assert any(map(right, found))
 
 
 def test_a_descent_ends_at_the_true_wiring_and_no_sooner():

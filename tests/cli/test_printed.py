@@ -1,0 +1,465 @@
+"""What commands print of a result, with the work behind them replaced by results by hand."""
+
+import re
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from surgisoft.cli import run
+from surgisoft.errors import InputError
+from surgisoft.measurement.recordings import Recording, save_recording
+
+NAN = float("nan")
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    """A recording of a second, and a folder that is no model."""
+    folder = tmp_path_factory.mktemp("bench")
+    pressure = np.linspace(0.0, 5.0, 20)[:, None] * [1.0, 1.1, 1.2]
+    points = np.arange(1.0, 16.0).reshape(5, 3) * (1.0 + 0.01 * pressure[:, :1, None])
+    some = Recording("bench", 0.05 * np.arange(20), pressure, points)
+    save_recording(some, folder / "bench.parquet")
+    return folder
+
+
+def result(**fields) -> SimpleNamespace:
+    """A result with these fields, whose JSON is empty."""
+    return SimpleNamespace(to_json=dict, notes=(), **fields)
+
+
+def printed(capsys, monkeypatch, target: str, found, *command: str, code: int = 0) -> str:
+    """What a command prints where the function behind it returns a result."""
+    monkeypatch.setattr(target, lambda *_, **__: found)
+    assert run(list(command)) == code
+    return capsys.readouterr().out
+
+
+AXES = (
+    SimpleNamespace(axis="pressure", share=0.5, ci95=(0.4, 0.6), static=True),
+    SimpleNamespace(axis="speed", share=0.3, ci95=(0.2, 0.4), static=False),
+    SimpleNamespace(axis="room", share=0.01, ci95=(0.0, 0.02), static=True),
+)
+
+
+def comparison(name: str, **fields) -> SimpleNamespace:
+    values = {
+        "sentence": f"{name} is off", "setup": "", "rmse_mm": 0.5, "tip_rmse_mm": 0.75,
+        "floor": SimpleNamespace(rmse_mm=0.05, source="holds"), "samples": 20, "missing": 0,
+        "components_mm": {"x": 0.1, "y": 0.2}, "mse_mm2": 0.25, "per_key_point_mm": [0.25, NAN],
+        "coverage": None, "time_shift": None, "axes": (), "change_axes": (), "worst": (),
+        "explainable": None, "rmse_ci95_mm": (0.4, 0.6),
+    }  # fmt: skip
+    table = SimpleNamespace(model=SimpleNamespace(summary=lambda: "an arm"))
+    numbers = result(**(values | fields))
+    return SimpleNamespace(
+        name=name, result=numbers, table=table, sentence=f"{name} is off", summary=f"arm {name}"
+    )
+
+
+def test_compare_prints_what_is_known_and_says_what_is_not(bench, capsys, monkeypatch):
+    target, rec = "surgisoft.diagnosis.compare.compare_all", str(bench / "bench.parquet")
+    moment = SimpleNamespace(error_mm=1.5, key_point=4, recording="bench", t_s=3.0, along_s=1.0)
+    one = comparison(
+        "default", tip_rmse_mm=NAN, floor=SimpleNamespace(rmse_mm=None, source="unknown"),
+        missing=3, setup="chambers 1 and 2 are swapped", axes=AXES, change_axes=AXES,
+        worst=(moment,),
+        time_shift=SimpleNamespace(seconds=0.1, ci95_s=(0.05, 0.15)), explainable=0.5,
+    )  # fmt: skip
+    out = printed(capsys, monkeypatch, target, [one], "compare", "default", rec)
+    assert "set-up: chambers 1 and 2 are swapped; `surgisoft diagnose` shows what mends it" in out
+    assert "RMSE 0.5000 mm, tip not measured, noise floor unknown, 20 samples, 3 rows" in out
+    assert "key points base to tip: 0.2500 - mm" in out
+    assert "the model states no prediction interval" in out
+    assert "the arm trails the model by 0.100 s (0.050 .. 0.150)" in out
+    assert re.search(r"pressure +explains +50 % \(40 .. 60\) alone", out)
+    assert re.search(r"speed +explains +30 % \(20 .. 40\) beyond actuation", out)
+    assert re.search(r"pressure +explains +50 % of the change", out)
+    assert "room" not in out, "too small to be shown"
+    assert "worst: 1.500 mm at key point 4, bench t = 3.00 s (1.00 s in the report)" in out
+    assert f"next, which effect is missing: surgisoft diagnose default {rec}\n" in out
+    two = [comparison("default", coverage=0.9), comparison("other", explainable=0.25)]
+    out = printed(capsys, monkeypatch, target, two, "compare", "default", "default", rec)
+    assert "90.0% of key points within the model's 95 % prediction interval" in out
+    assert "\nother is off\narm other\n" in out
+    assert re.search(r"other +0\.5000 +0\.4000 \.\. 0\.6000 +0\.7500 +25 %\n", out)
+    assert re.search(r"default +0\.5000 .* -\n", out)
+    assert "which effect is missing" not in out
+
+
+def summary(mean: float, episodes: int = 3) -> SimpleNamespace:
+    return SimpleNamespace(mean=mean, low=mean - 0.1, high=mean + 0.1, episodes=episodes)
+
+
+def test_evaluate_prints_a_column_for_each_policy(capsys, monkeypatch):
+    facts = {
+        "instants": 10, "contact_differs": 1, "beam_differs": 2, "beam_off_mm": 0.25,
+        "contact_asked": 3, "beams_asked": 4,
+    }  # fmt: skip
+    scripted = SimpleNamespace(
+        policy="scripted", overall={"success": summary(0.5), "error_mm": summary(0.25)},
+        checks=object(), to_json=lambda: {"referee": facts},
+    )  # fmt: skip
+    learned = SimpleNamespace(
+        policy="runs/ring", overall={"success": summary(NAN, 0)}, checks=None, to_json=dict
+    )
+    found = result(
+        task="track_circle", results=[scripted, learned], success_rule="within 1 mm",
+        measured_arms=("arm",), logs={},
+    )  # fmt: skip
+    out = printed(
+        capsys, monkeypatch, "surgisoft.agents.session.evaluate", found,
+        "evaluate", "scripted", "--task", "track_circle", "--on", "rig", "--observer-gain", "0.5",
+    )  # fmt: skip
+    assert re.search(r"^ +scripted +ring\n", out, re.M)
+    assert re.search(r"success +50\.0% \[40\.0%, 60\.0%\] +-\n", out)
+    assert re.search(r"error_mm +0\.25 \[0\.15, 0\.35\] +-\n", out)
+    assert "of 10 instants the batched geometry differs on contact in 1 and on what the" in out
+    assert "success: within 1 mm\n" in out
+    assert "arm: on a real bench, whose true body is not known" in out
+
+
+def found_setup(**fields) -> SimpleNamespace:
+    values = {
+        "mendable": False, "recordings": ("bench",), "mending": "turn the tracker\nby a quarter",
+        "alternative_mendings": (), "how_to_tell": "", "mended": lambda some: some,
+    }  # fmt: skip
+    return SimpleNamespace(**(values | fields))
+
+
+def diagnosis(**fields) -> SimpleNamespace:
+    values = {
+        "verdict": SimpleNamespace(kind="setup", sentence="the frame is turned"),
+        "error_mm": SimpleNamespace(before=0.5, floor=0.05, ceiling=0.1), "track": None,
+        "setup": None, "next_command": "", "next_experiment": None, "refit": None, "checks": (),
+        "shown": (), "not_testable": (), "seconds": 1.5,
+    }  # fmt: skip
+    return result(**(values | fields))
+
+
+def test_diagnose_prints_what_mends_a_set_up(bench, tmp_path, capsys, monkeypatch):
+    target, rec = "surgisoft.diagnosis.diagnose.diagnose", str(bench / "bench.parquet")
+    new = tmp_path / "mended"
+    both = found_setup(alternative_mendings=("swap two tubes",), how_to_tell="shake chamber 1")
+    command = ["diagnose", "default", rec]
+    found = diagnosis(setup=both)
+    out = printed(capsys, monkeypatch, target, found, *command, "--apply", str(new))
+    assert "to mend it:\n  turn the tracker\n  by a quarter\nor, for the other expl" in out
+    assert "other explanation:\n  swap two tubes\nshake chamber 1\n1.5 s\n" in out
+    assert f"{new} was not written: that cannot be mended in the recordings" in out
+    assert out.endswith("next: turn the tracker\n")
+    assert not new.exists()
+    found = diagnosis(setup=found_setup(mendable=True))
+    out = printed(capsys, monkeypatch, target, found, *command)
+    assert "to mend it, in the map of `surgisoft import`:" in out
+    assert out.endswith(f"next: surgisoft diagnose default {rec} --apply MENDED\n")
+    out = printed(capsys, monkeypatch, target, found, *command, "--apply", str(new))
+    assert out.endswith(f"next: surgisoft diagnose default {new}\n")
+    assert [path.name for path in new.glob("*.parquet")] == ["bench.parquet"]
+    none = diagnosis(verdict=SimpleNamespace(kind="nothing_missing", sentence="fits"))
+    out = printed(capsys, monkeypatch, target, none, *command, "--apply", str(tmp_path / "x"))
+    assert out.endswith(f"nothing to mend: {tmp_path / 'x'} was not written\n")
+    before = ["--before", rec, "--replay", str(tmp_path / "a.rrd")]
+    monkeypatch.setattr(target, lambda *_, **__: none)
+    assert run([*command, *before]) == 0
+    assert "was not written: no rows of the same actuation before and" in capsys.readouterr().err
+    assert not (tmp_path / "a.rrd").exists()
+
+
+def test_diagnose_prints_candidates_and_the_next_step(bench, capsys, monkeypatch):
+    row = SimpleNamespace(
+        effect="creep", ci95=(0.1, 0.2), confidence=0.9, gain_alone=0.5, gain_unique=0.25,
+        heldout_rmse_mm=0.15,
+    )  # fmt: skip
+    tried = SimpleNamespace(
+        effect="lag", ci95_mm=(0.01, 0.02), plausible=False, heldout_rmse_mm=0.3, rival_mm=0.4,
+        difference_mm=0.1, p_value=0.01,
+    )  # fmt: skip
+    refit = SimpleNamespace(
+        reason="a lag is close", candidates=[tried],
+        not_tried=[("leak", "steady-state samples"), ("twist", "named already")],
+    )  # fmt: skip
+    plan = SimpleNamespace(name="ramps", minutes=5.0, separates=[("creep", "leak")])
+    found = diagnosis(
+        verdict=SimpleNamespace(kind="ambiguous", sentence="creep or leak"), refit=refit,
+        shown=[row], checks=("the clock is even",), next_experiment=plan,
+        not_testable=[SimpleNamespace(effect="drift", reason="too short")],
+        next_command="surgisoft next-experiment {model} {data}{before} -o NEW.csv",
+    )  # fmt: skip
+    rec = str(bench / "bench.parquet")
+    target = "surgisoft.diagnosis.diagnose.diagnose"
+    out = printed(
+        capsys, monkeypatch, target, found, "diagnose", "default", rec, "--before", rec
+    )  # fmt: skip
+    assert "check: the clock is even\n" in out
+    assert re.search(r"creep +0\.90 +50\.0% +25\.0% +0\.1500 \[0\.1000, 0\.2000\] mm", out)
+    assert "not testable: drift: too short" in out
+    assert "fitted together with the network, because a lag is close:" in out
+    assert re.search(r"lag .*\[0\.0100, 0\.0200\] mm +0\.0100  implausible parameters\n", out)
+    assert "not tried, because steady-state samples cannot show them: leak\n" in out
+    assert "next experiment: ramps, 5 minutes, distinguishes creep from leak" in out
+    assert out.endswith(
+        f"next: surgisoft next-experiment default {rec} --before {rec} -o NEW.csv\n"
+    )
+    plain = SimpleNamespace(reason="x", candidates=[], not_tried=[("twist", "named already")])
+    shown = printed(
+        capsys, monkeypatch, target, diagnosis(refit=plain), "diagnose", "default", rec
+    )  # fmt: skip
+    assert "not tried" not in shown
+
+
+PARAMETER = SimpleNamespace(
+    effect="creep", name="tau", unit="s", interval_text="2 to 4", value=3.0, plausible=False,
+    plausible_range=(5.0, 9.0), source="Smith 2001",
+)  # fmt: skip
+UNITLESS = SimpleNamespace(**(vars(PARAMETER) | {"unit": "", "interval_text": "", "name": "share"}))
+
+
+def test_amend_and_improve_write_nothing_where_nothing_is_claimed(
+    bench, tmp_path, capsys, monkeypatch
+):
+    rec, new, numbers = (str(p) for p in (bench / "bench.parquet", tmp_path / "n", tmp_path / "j"))
+    rounds = [
+        SimpleNamespace(step="creep", together=True, rivals=("leak",), verdict="identified",
+                        sentence="creep is missing", error_open_mm=0.2),
+        SimpleNamespace(step=None, together=False, rivals=(), verdict="nothing_missing",
+                        sentence="it fits", error_open_mm=0.2),
+    ]  # fmt: skip
+    found = result(
+        claimed=False, rounds=rounds, steps=[("creep", 0.3)], parameters=[PARAMETER, UNITLESS],
+        held_out=SimpleNamespace(before=0.5, floor=0.1), sentence="no significant fall",
+    )  # fmt: skip
+    command = ["improve", "default", rec, "-o", new, "--json", numbers + ".json"]
+    target = "surgisoft.diagnosis.improve.improve"
+    out = printed(capsys, monkeypatch, target, found, *command, code=1)
+    assert "  + creep, fitted together with the network (or leak): error on the training" in out
+    assert "round 2: nothing_missing: it fits\n  no further effect: error" in out
+    assert "  creep: tau = 3 s (2 to 4)\n  creep: share = 3\n" in out
+    assert "implausible: creep tau = 3, expected 5 to 9 s (Smith 2001)\n" in out
+    assert re.search(r"before +0\.5000 mm on the held-out part\n\+ creep +0\.3000 mm\nfloor", out)
+    assert out.endswith(f"no significant fall\n{new} was not written\n")
+    assert not Path(new).exists()
+    assert Path(numbers + ".json").read_text().strip() == "{}"
+    found.steps, found.rounds = [], []
+    out = printed(capsys, monkeypatch, target, found, *command[:-2], code=1)
+    assert out == f"no significant fall\n{new} was not written\n"
+    tried = result(
+        claimed=False, effects=("creep",), refitted=("creep",), parameters=[], retuned=True,
+        refit=SimpleNamespace(sentence="creep lowers it"), sentence="no significant fall",
+    )  # fmt: skip
+    out = printed(
+        capsys, monkeypatch, "surgisoft.diagnosis.amend.amend", tried,
+        "amend", "default", "--effect", "creep", "--data", rec, "-o", new, code=1,
+    )  # fmt: skip
+    assert "creep: the model had this effect already; its parameters were fitted again\n" in out
+    assert "the network's last layer was fitted again, which lowers the error on held-out" in out
+    assert "creep lowers it, with parts of the training data left out\n" in out
+    assert f"{new} was not written; --anyway writes it nevertheless" in out
+    assert not Path(new).exists()
+
+
+def test_train_says_how_to_go_on(tmp_path, capsys, monkeypatch):
+    def run_of(best, done=True, leads=True):
+        numbers = SimpleNamespace(done=done, steps=1500, wall_s=60.0, cpu_s=50.0, best=best)
+        return SimpleNamespace(leads=leads, result=numbers, folder=Path("runs/x"))
+
+    target = "surgisoft.agents.training_request.train"
+    monkeypatch.setattr("surgisoft.agents.training_request.shortfall", lambda run: "")
+    command = ["train", "--task", "track_circle"]
+    assert printed(capsys, monkeypatch, target, run_of(None, leads=False), *command) == ""
+    out = printed(capsys, monkeypatch, target, run_of(None, done=False), *command, code=130)
+    assert out == "stopped after 1,500 steps; continue with: surgisoft train --resume runs/x\n"
+    for best, said in (
+        (None, "best not evaluated yet"),
+        ({"success": 0.5}, "best evaluation: success 50%\n"),
+        ({"error_mm": NAN}, "best evaluation: error not measured\n"),
+        ({"success": 1.0, "error_mm": 0.25}, "best evaluation: success 100%, error 0.2500 mm\n"),
+    ):
+        out = printed(capsys, monkeypatch, target, run_of(best), *command)
+        assert f"(50 s of processor), {said}" in out
+        assert "next: surgisoft evaluate runs/x\n" in out
+
+
+RUN = ["run", "scripted", "-o", "new.parquet"]
+
+
+def live(**fields) -> SimpleNamespace:
+    values = {
+        "timing": SimpleNamespace(sentence="on time"), "alarms": (), "tracking": (), "judged": 1.0,
+        "tracking_mm": lambda a=0.0, b=1.0: 0.5, "rms_mm": lambda a=0.0, b=1.0: 0.25,
+        "detector": SimpleNamespace(judges=True), "statistic": (0.5, NAN, 0.75), "written": (),
+        "ended_by": None,
+    }  # fmt: skip
+    return result(**(values | fields))
+
+
+@pytest.mark.parametrize(
+    ("fields", "said", "not_said"),
+    [
+        ({}, "error of the model: 0.250 mm\nno alarm; highest alarm level 0.75 of 1\n", "task"),
+        ({"tracking": (1,)}, "error of the task: 0.500 mm\n", "judged"),
+        ({"tracking": (1,), "tracking_mm": lambda *_: NAN}, "on time", "error of the task"),
+        ({"judged": 0.5}, "judged: 50% of the time after the reference; the rest is", "task"),
+        ({"detector": None}, "no change detector: the run was shorter than its clean", "alarm"),
+        ({"detector": SimpleNamespace(judges=False)},
+         "no change detector: its clean reference does not repeat its motions", "alarm"),
+        ({"statistic": ()}, "no alarm; highest alarm level 0.00 of 1\n", "task"),
+        ({"alarms": (SimpleNamespace(since_s=4.0),), "written": ("a.csv", "b.csv")},
+         "error of the model: before the change 0.250 mm, after it 0.250 mm\n", "no alarm"),
+    ],
+)  # fmt: skip
+def test_run_prints_errors_and_what_the_detector_judged(
+    fields, said, not_said, capsys, monkeypatch
+):
+    out = printed(capsys, monkeypatch, "surgisoft.live.session.run", live(**fields), *RUN)
+    assert said in out
+    assert not_said not in out
+    if "alarms" in fields:
+        assert out.endswith("next: surgisoft diagnose default b.csv\n")
+
+
+def test_a_run_that_was_ended_prints_its_result_first(capsys, monkeypatch):
+    found = live(ended_by=InputError("the cable was cut"))
+    monkeypatch.setattr("surgisoft.live.session.run", lambda *_, **__: found)
+    assert run(RUN) == 2
+    shown = capsys.readouterr()
+    assert "on time" in shown.out
+    assert shown.err.endswith("error: the cable was cut\n")
+
+
+def test_demo_and_replay_print_where_things_are(tmp_path, capsys, monkeypatch):
+    def demo(output, progress, on_step):
+        for name in ("cut", "diagnose"):
+            on_step(name, "done")
+        return SimpleNamespace(page=output / "index.html", no_picture=no_picture)
+
+    monkeypatch.setattr("surgisoft.demonstration.demo", demo)
+    for no_picture in ("", "no browser"):
+        assert run(["demo", "-o", str(tmp_path)]) == 0
+        out = capsys.readouterr().out
+        assert out.startswith(f"1. cut: done\n   its picture: {tmp_path / 'index.html'}, which")
+        assert "2. diagnose: done\n" in out
+        assert out.count("its picture") == 1
+        assert ("no picture of the replay: no browser\n" in out) == bool(no_picture)
+    target = "surgisoft.replay.show.open_replay"
+    out = printed(capsys, monkeypatch, target, "wrote a.rrd", "replay", "a.npz")
+    assert out == "wrote a.rrd\n"
+    shot = ["replay", "a.npz", "--screenshot", str(tmp_path / "a.png")]
+    assert printed(capsys, monkeypatch, target, None, *shot) == f"wrote {tmp_path / 'a.png'}\n"
+    assert printed(capsys, monkeypatch, target, None, "replay", "a.npz") == ""
+
+
+def test_a_scene_is_shown_where_it_is_asked_for(tmp_path, capsys, monkeypatch):
+    shown = []
+    for name in ("open_viewer", "serve_viewer", "take_screenshot"):
+        target = f"surgisoft.replay.viewer.{name}"
+        monkeypatch.setattr(target, lambda *given, name=name: shown.append((name, given[1:])))
+    monkeypatch.setattr("surgisoft.replay.scene_view.save_scene_view", lambda *_: None)
+    monkeypatch.setattr("surgisoft.tasks.world.reach.reaches_of", lambda scene: {})
+    command = ["scene", "show", "phantom_liver"]
+    assert run(command) == 0
+    assert run([*command, "--web", "--port", "9099"]) == 0
+    assert run([*command, "--screenshot", str(tmp_path / "a.png")]) == 0
+    assert capsys.readouterr().out == f"wrote {tmp_path / 'a.png'}\n"
+    names = [name for name, _ in shown]
+    assert names == ["open_viewer", "serve_viewer", "take_screenshot"]
+    assert shown[1][1][-1] == 9099
+    assert shown[2][1][:2] == (tmp_path / "a.png", "Scene")
+    assert run([*command, "--port", "9099"]) == 2
+    assert "--port applies to a browser only: give --web too" in capsys.readouterr().err
+
+
+REFUSED = {
+    "compare default {rec} --error-scale 1": "--error-scale scales the colours of a replay; add",
+    "compare default default": "default: models only; expected recordings",
+    "compare lab default {rec} --predictions {rec}": "--predictions is for one model; leave",
+    "compare default {rec} default": "default: a model after a recording; give all models first",
+    "compare default {rec} --paired maybe": "unknown value of --paired 'maybe'",
+    "compare default {rec} --paired always": "nothing to pair with; add --before REC",
+    "compare default {rec} --replay {dir}/a.txt": "suffix '.txt', expected .rrd",
+    "compare default {rec} --replay {dir}/folder.rrd": "is a folder, expected a file to write",
+    "evaluate scripted --on moon": "unknown place 'moon'",
+    "evaluate scripted --on simulation --rig virtual": "--rig names the plant, but --on is",
+    "evaluate scripted --task track_circle --preflight": "--preflight is for real rigs; name one",
+    "evaluate scripted --rules liver --task keyhole": "is an experiment of circle_ablation, not of",
+    "evaluate scripted --rules liver --config a.toml": "--config and --rules both set the task",
+    "next-experiment default -o {dir}/a.txt": "suffix '.txt', expected .csv, which `collect` can",
+    "next-experiment default -o {dir}/full.csv": "full.csv: exists already; choose another name",
+    "collect walk --preflight -o {dir}/a.csv": "expected the model of this arm too; add --arm",
+    "collect walk --arm default -o {dir}/a.csv": "--arm names the model of the pre-flight check",
+    "collect walk --dry-run -o {dir}/a.csv": "a dry run is for real rigs, and this one is sim",
+    "collect walk --hidden creep:2 --strength 1 -o {dir}/a.csv": "both give amplitudes; use one",
+    "collect walk --hidden creep leak --strength 1 -o {dir}/a.csv": "2 --hidden and 1 --strength",
+    "import {dir}/full.csv": "-o is missing: a new recording (.csv, .parquet) or a folder",
+    "import {dir}/full.csv -o {dir}/a.csv": "--map is missing: a map file states columns",
+    "import {dir}/full.csv -o {dir}/a.xlsx": "suffix '.xlsx', expected .csv, .parquet or a folder",
+    "import {dir}/full.csv {rec} --draft {dir}/m.toml": "2 raw files or a folder, expected one",
+    "import {dir} --draft {dir}/m.toml": "1 raw files or a folder, expected one text file",
+    "import {dir}/full.csv --draft {dir}/m.txt": "suffix '.txt', expected .toml",
+    "import {dir}/full.csv --draft {dir}/old.toml": "old.toml: exists already; choose another",
+    "run scripted -o {dir}/a.csv --show --web": "--show and --web: expected at most one of them",
+    "improve default {rec} -o default": "is the folder of the model to amend; choose another",
+    "scene new a.stl -o {dir}/s --clearance 200": "--clearance is 200; expected 0 to 100 mm",
+    "scene new a.stl -o {dir}/s --margin -1": "--margin is -1; expected 0 to 100 mm",
+    "scene new a.stl -o {dir}/s --diameter 0.1": "--diameter is 0.1; expected 0.5 to 500 mm",
+    "scene new a.stl -o {dir}/s --lesion 0 0 nan": "expected finite coordinates",
+    "scene new a.stl -o {dir}/s --lesion-direction 0 0 0": "expected a vector that is not zero",
+    "train task=keyhole --task keyhole": "task=keyhole and --task: give one of them",
+    "train steps=many": "steps=many: expected an integer",
+}
+
+
+@pytest.mark.parametrize("command", REFUSED)
+def test_what_cannot_be_meant_is_one_line(command, bench, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder.rrd").mkdir()
+    for name in ("full.csv", "old.toml", "a.stl"):
+        (tmp_path / name).write_text("x")
+    before = sorted(tmp_path.rglob("*"))
+    assert run(command.format(rec=bench / "bench.parquet", dir=tmp_path).split()) == 2
+    error = capsys.readouterr().err.strip()
+    assert REFUSED[command] in error
+    assert len(error.splitlines()) == 1
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_missing_library_is_named_with_its_extra(capsys, monkeypatch):
+    def missing(name):
+        def raised(*_, **__):
+            raise ModuleNotFoundError(f"No module named '{name}'", name=name)
+
+        monkeypatch.setattr("surgisoft.replay.show.open_replay", raised)
+
+    missing("rerun_cli.node")
+    assert run(["replay", "a.npz"]) == 2
+    said = capsys.readouterr().err
+    assert "'rerun_cli' is missing; install it with: pip install 'surgisoft[replay]'" in said
+    missing("a_module_of_the_user")
+    with pytest.raises(ModuleNotFoundError, match="a_module_of_the_user"):
+        run(["replay", "a.npz"])
+
+
+def test_a_command_that_a_signal_ended_has_its_exit_code(capsys, monkeypatch):
+    from surgisoft.rig.safety import Terminated
+
+    def ended(code):
+        def raised(*_, **__):
+            raise code
+
+        monkeypatch.setattr("surgisoft.replay.show.open_replay", raised)
+
+    ended(Terminated(15))
+    assert run(["replay", "a.npz"]) == 143
+    assert capsys.readouterr().err == "surgisoft: ended by SIGTERM\n"
+    ended(SystemExit(3))
+    with pytest.raises(SystemExit):
+        run(["replay", "a.npz"])
+
+
+def test_a_group_without_a_command_prints_its_help(capsys):
+    assert run(["scene"]) == 2
+    shown = capsys.readouterr()
+    assert "Usage: surgisoft scene" in shown.out
+    assert shown.err == ""

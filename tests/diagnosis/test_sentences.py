@@ -1,0 +1,227 @@
+"""What results made by hand say: amendments, diagnoses and what is left after an experiment."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from surgisoft.diagnosis.amend import Amendment, Fall
+from surgisoft.diagnosis.decision import (
+    ASSET,
+    Decision,
+    Probabilities,
+    Statement,
+    content_hash,
+    load_decision,
+)
+from surgisoft.diagnosis.design.schedules import SETUPS
+from surgisoft.diagnosis.diagnose import ErrorLevels, effect_left, next_command, sentence_of
+from surgisoft.diagnosis.improve import Improvement
+from surgisoft.diagnosis.other_models import callable_arm, open_model
+from surgisoft.errors import InputError
+from surgisoft.surrogate.callables.named import given_callable
+from tests.diagnosis.synthetic import recording, still_model, walk
+
+
+def fall(before=0.5, after=0.2, **fields) -> Fall:
+    values = {"floor": 0.1, "fall": before - after, "ci95": (0.1, 0.4), "rows": 90, "blocks": 9}
+    return Fall(before, after, **(values | fields))
+
+
+def amendment(**fields) -> Amendment:
+    values = {
+        "model": None, "effects": ("creep",), "refitted": (), "parameters": (),
+        "held_out": fall(0.5, 0.15), "alone": fall(), "training": fall(), "retuned": False,
+        "tracks": (None, None), "seconds": 1.0,
+    }  # fmt: skip
+    return Amendment(**(values | fields))
+
+
+CHANGE = SimpleNamespace(before=("monday", "tuesday"))
+NUMBERS = "0.500 to 0.200 mm on held-out data (fall 0.300 mm, 95 % 0.100 to 0.400; floor 0.100 mm)"
+
+
+@pytest.mark.parametrize(
+    ("fields", "sentence"),
+    [
+        ({}, f"creep: error {NUMBERS}"),
+        (
+            {"retuned": True},
+            f"creep: error {NUMBERS}; 0.150 mm with the network's last layer re",
+        ),
+        (
+            {"alone": fall(ci95=(-0.1, 0.4))},
+            "creep: no fall of the error is claimed: 0.500 to",
+        ),
+        (
+            {"change": CHANGE, "model_error": fall(2.0, 1.5)},
+            "creep: change since monday + tuesday: 0.500 to 0.200 mm",
+        ),
+        (
+            {"refit": object()},
+            "fitted together with the network; the network alone, trained for as many epochs, rea",
+        ),
+        (
+            {"refit": object(), "held_out": fall(in_fit=0.25)},
+            "the given model, which had been fitted to 25% of these rows, has 0.500 mm there",
+        ),
+        (
+            {"refit": object(), "alone": fall(ci95=(-0.1, 0.4))},
+            "no fall of the error is claimed for the effects: the network alone, trained for as m",
+        ),
+    ],
+)
+def test_an_amendment_says_what_it_is_worth(fields, sentence):
+    assert sentence in amendment(**fields).sentence
+
+
+def test_a_fall_is_claimed_where_it_is_certain_large_and_due_to_the_effects():
+    assert fall().claimed
+    assert not fall(ci95=(-0.01, 0.4)).claimed
+    assert "is not significant" in fall(ci95=(-0.01, 0.4)).sentence
+    assert not fall(fall=1e-4, ci95=(1e-5, 2e-4)).claimed
+    assert fall(fall=1e-4, ci95=(1e-5, 2e-4)).sentence.endswith("is too small")
+    assert not fall(p_value=0.9).claimed
+    assert (
+        "may be the network's own error, which the effect resembles (p 0.9)"
+        in fall(p_value=0.9).sentence
+    )
+    changed = amendment(change=CHANGE, model_error=fall(2.0, 1.5), retuned=True)
+    assert changed.sentence.endswith("2.000 to 1.500 mm, its network's last layer re-tuned")
+
+
+def test_an_improvement_says_what_was_added():
+    rounds = (SimpleNamespace(step="creep", error_mm=0.2), SimpleNamespace(step=None, error_mm=0.2))
+    found = Improvement(None, rounds, (), fall(), (None, None), 1.0)
+    assert found.claimed
+    assert found.sentence == f"creep: error {NUMBERS}"
+    nothing = Improvement(
+        None, (SimpleNamespace(step=None, error_mm=None, sentence="it fits"),), (), fall(),
+        (None, None), 1.0,
+    )  # fmt: skip
+    assert not nothing.claimed
+    assert nothing.sentence == "nothing was added: it fits"
+
+
+CHANCES = Probabilities(0.1, 0.1, 0.1, {"creep": 0.5, "drift": 0.2}, 0.0, ())
+NONE = Probabilities(0.1, 0.1, 0.8, {}, 0.0, ())
+LEVELS = ErrorLevels(0.5, 0.1, 0.2)
+STATEMENTS = (
+    Statement("identified", ("creep",), 0.4, 0.3),
+    Statement("ambiguous", ("creep", "drift"), 0.9, 0.2),
+    Statement("nothing_missing", (), 0.3, 0.1),
+)
+
+
+def decision(kind, *effects, reason=None, chances=CHANCES, statements=()) -> Decision:
+    return Decision(kind, effects, 0.75, chances, reason, statements)
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence", "command"),
+    [
+        (decision("identified", "creep"), "creep is missing (confidence 0.75): with it 0.15 mm rem",
+         "surgisoft amend {model} --effect creep --data {data}{before} -o NEW"),
+        (decision("several", "creep", "drift"), "creep and drift are missing (confidence 0.75 in b",
+         "surgisoft amend {model} --effect creep drift --data {data}{before} -o NEW"),
+        (decision("ambiguous", "creep", "drift"), "cannot tell creep from drift with these record",
+         "surgisoft next-experiment {model} {data} --between creep drift -o SCHEDULE.csv"),
+        (decision("unknown_effect"), "none of the known effects (confidence 0.75; creep is nearest",
+         ""),
+        (decision("unknown_effect", chances=NONE), "(confidence 0.75; none is near)", ""),
+        (decision("surrogate_undertrained"), "its validated error says so too: it needs a longer",
+         "surgisoft fit {data} -o NEW"),
+        (decision("surrogate_undertrained", reason="network"), "the model does not describe this a",
+         "surgisoft fit {data} -o NEW"),
+        (decision("surrogate_undertrained", reason="learned"), "has learned part of it, fit one to",
+         "surgisoft fit {data} --inputs pressure --effects creep -o NEW"),
+        (decision("cannot_tell", reason="few_data", statements=STATEMENTS),
+         "(most probable: creep is missing 0.40, nothing is missing 0.30); error 0.5 mm, floor 0.1",
+         "surgisoft next-experiment {model} {data} --between creep drift -o SCHEDULE.csv"),
+        (decision("cannot_tell", chances=NONE), "several causes explain these recordings about as",
+         "surgisoft next-experiment {model} {data} -o SCHEDULE.csv"),
+        (decision("nothing_missing"), "nothing is missing that these recordings could show; error",
+         ""),
+    ],
+)  # fmt: skip
+def test_each_kind_of_result_has_its_sentence_and_its_next_command(given, sentence, command):
+    assert sentence in sentence_of(given, LEVELS, 0.15)
+    assert next_command(given) == command
+
+
+def test_what_an_experiment_leaves():
+    """By hand something is taken away: the error goes with it, or it is one of the others."""
+    taking, plain = (
+        next(name for name, setup in SETUPS.items() if bool(setup.removes) == removes)
+        for removes in (True, False)
+    )
+    taken = SETUPS[taking].removes[0]
+
+    def advice(setting, *effects):
+        return SimpleNamespace(setting=setting, pairs=(SimpleNamespace(effects=effects),))
+
+    def result(kind, *effects):
+        return SimpleNamespace(verdict=SimpleNamespace(kind=kind, effects=effects))
+
+    assert effect_left(advice(plain, "a", "b"), result("identified", "a")) == "a"
+    assert effect_left(advice(plain, "a", "b"), result("ambiguous", "a", "b")) is None
+    assert effect_left(advice(taking, taken, "b"), result("nothing_missing")) == taken
+    assert effect_left(advice(taking, taken, "b"), result("identified", "c")) == "b"
+    three = advice(taking, taken, "b", "c")
+    assert effect_left(three, result("identified", "c")) == "c"
+    assert effect_left(three, result("ambiguous", "b", "c")) is None
+
+
+def test_a_damaged_decision_is_one_line(tmp_path):
+    good = json.loads(ASSET.read_text())
+    name = next(iter(good["models"]))
+    weights = good["models"][name]["weights"]
+    first = next(iter(weights))
+
+    def model(**fields) -> dict:
+        return {"models": good["models"] | {name: good["models"][name] | fields}}
+
+    path = tmp_path / "decision.json"
+    for changes, message in (
+        ({"schema": True}, "a fitted decision of schema True, expected"),
+        (model(weights={}), f"model '{name}' has the features , expected"),
+        (model(weights=weights | {first: None}), "has a weight that is no finite number"),
+        (model(constant="x"), "has a weight that is no finite number"),
+        ({"calibration": []}, "calibration is no table; fit it again"),
+        ({"calibration": {"ghost": {"constant": 0.0, "slope": 1.0}}}, "calibration 'ghost' is not"),
+    ):
+        values = good | changes
+        path.write_text(json.dumps(values | {"sha256": content_hash(values)}))
+        with pytest.raises(InputError, match=r"^decision\.json: ") as error:
+            load_decision(path)
+        assert message in str(error.value)
+        assert "\n" not in str(error.value)
+    path.write_text(json.dumps(good | {"sha256": "0"}))
+    with pytest.raises(InputError, match="does not match its hash; install again"):
+        load_decision(path)
+    with pytest.raises(InputError, match=r"none\.json: no fitted decision"):
+        load_decision(tmp_path / "none.json")
+    path.write_text(ASSET.read_text())
+    assert set(load_decision(path).models) == set(good["models"])
+
+
+class Wide:
+    """A callable that states the range of four chambers."""
+
+    low, high = [0.0] * 4, [9.0] * 4
+
+    def __call__(self, time_s, actuation):
+        return np.zeros((len(actuation), 3, 3))
+
+
+def test_models_of_other_origin_that_do_not_fit():
+    some = recording(np.zeros(60), walk(60))
+    with pytest.raises(InputError, match="states the range of 4 chambers, but recording 'made'"):
+        callable_arm(given_callable(Wide()), [some])
+    with pytest.raises(InputError, match="take the place of a model: expected a name for it"):
+        open_model(still_model(), [some], predictions=["a.csv"])
+    with pytest.raises(InputError, match="expected --model-error only with a callable or"):
+        open_model(still_model(), [some], error_mm=0.5)
+    opened = open_model(still_model(), [some])
+    assert opened.model.spec.chambers == 2

@@ -1,0 +1,164 @@
+"""Experiments that cannot be meant, and rare ways through those that can."""
+
+import re
+import shutil
+from dataclasses import replace
+
+import pytest
+import torch
+
+from surgisoft.agents.run_folder import PACKAGED
+from surgisoft.config import read_toml
+from surgisoft.errors import InputError
+from surgisoft.experiments.controllers import PhaseControllers, Schedule
+from surgisoft.experiments.phases import PhasedTask, with_phase_events
+from surgisoft.experiments.plan import build_task, rig_config, scene_of, settings
+from surgisoft.experiments.session import (
+    experiments_of,
+    start_experiment,
+    with_policy,
+)
+from surgisoft.experiments.spec import Fault, Lesion, load_experiment
+from surgisoft.tasks.base import Episodes
+from surgisoft.tasks.circle_ablation import CircleAblation
+from surgisoft.tasks.laser_supervision import LaserSupervision
+from tests.experiments.tiny import FAULT, TINY, write
+from tests.tasks.test_episode import made_up
+
+VARY = '[[vary]]\nfield = "{field}"\nvalues = [{values}]\n'
+RIG = '[[cases]]\nname = "rig"\nplant = "rig"\n'
+
+
+def spec_of(folder, text: str = TINY):
+    return load_experiment(write(folder, text))
+
+
+@pytest.mark.parametrize(
+    ("field", "values", "message"),
+    [
+        ("task.fire_mm", "1.0, 1.0", "'simulation_fire_mm=1' comes twice; expected values that"),
+        ("hidden.creep", "-1.0", "got -1.0; expected amplitudes from 0"),
+        ("hidden.creep", '"much"', "got 'much'; expected amplitudes from 0"),
+        ("fault.chamber", "0", "got 0; expected what a fault has as chamber"),
+        ("fault.at_s", "-0.5", "got -0.5; expected what a fault has as at_s"),
+    ],
+)
+def test_values_that_cannot_vary_are_named(field, values, message, tmp_path):
+    path = write(tmp_path, TINY + FAULT + VARY.format(field=field, values=values))
+    with pytest.raises(InputError, match=re.escape(message)):
+        settings(load_experiment(path), read_toml(path)[1])
+
+
+def test_hidden_effects_and_robots_vary_on_the_rig(tmp_path):
+    text = TINY + RIG + VARY.format(field="hidden.creep", values="0.0, 2.0")
+    text += VARY.format(field="rig.specimen", values="3, 4")
+    spec = spec_of(tmp_path, text)
+    found = [rig_config(each, None, spec.of.agents) for each in settings(spec)]
+    assert [(each.seed, each.hidden) for each in found] == [
+        (3, ()),
+        (4, ()),
+        (3, (("creep", 2.0),)),
+        (4, (("creep", 2.0),)),
+    ]
+    wrong = RIG + 'hidden = ["creep:much"]\n'
+    with pytest.raises(InputError, match=r"got 'creep:much'; expected NAME or NAME:STRENGTH"):
+        settings(spec_of(tmp_path, TINY + wrong))
+
+
+def test_a_lesion_of_an_experiment_lies_on_the_organ(tmp_path):
+    spec = spec_of(tmp_path)
+    (setting,) = settings(spec)
+    own = scene_of(spec, setting)
+    moved = replace(setting, lesion=Lesion("here", tuple(own.ring.centre_mm), 12.0))
+    assert scene_of(spec, moved).spec.lesion.diameter_mm == 12.0
+    away = replace(setting, lesion=Lesion("away", (1e4, 0.0, 0.0), 12.0))
+    with pytest.raises(InputError, match="lesion 'away': "):
+        scene_of(spec, away)
+
+
+def test_a_case_may_have_an_arm_model_of_its_own(tmp_path):
+    spec = spec_of(tmp_path)
+    (setting,) = settings(spec)
+    with pytest.raises(InputError, match="no arm model there"):
+        build_task(spec, replace(setting, case=replace(setting.case, arm=str(tmp_path / "none"))))
+
+
+def test_folders_and_options_that_do_not_fit(tmp_path):
+    (run,) = (path for path in PACKAGED.iterdir() if (path / "config.json").is_file())
+    spec = spec_of(tmp_path)
+    (tmp_path / "empty").mkdir()
+    file = write(tmp_path)
+    line = 'scenario = "track_circle"\n[[phases]]\nname = "a"\ntimeout_s = 1.0\narm = "policy"\n'
+    other = load_experiment(write(tmp_path, 'name = "tiny"\n' + line, "other.toml"))
+    twice = with_policy(spec, run)
+    assert [case.name for case in twice.cases] == ["simulation", f"simulation-{run.name}"]
+    assert twice.cases[1].policy == str(run.resolve())
+    out = tmp_path / "out"
+    for call, message in (
+        (lambda: experiments_of(tmp_path / "empty"), "no experiment (*.toml) there"),
+        (lambda: with_policy(other, run), "was trained on circle_ablation; expected a run of trac"),
+        (lambda: with_policy(twice, run), "there is a case of that name already; rename the fold"),
+        (lambda: start_experiment(file, out, resume=True, force=True), "--resume continues resul"),
+        (lambda: start_experiment(file, out, preflight=True), "--preflight is for real rigs; nam"),
+        (lambda: start_experiment(file, out, rigs=["virtual"]), "no case with plant = 'rig' that"),
+    ):
+        with pytest.raises(InputError, match=re.escape(message)):
+            call()
+    assert not out.exists()
+    on_rig, folder = start_experiment(
+        write(tmp_path, TINY + RIG), out, policies=[run], rigs=["virtual:seed=5"], repeats=2
+    )
+    assert (on_rig.repeats, folder) == (2, out)
+    assert [case.rigs for case in on_rig.cases if case.plant == "rig"] == [("virtual:seed=5",)] * 2
+
+
+@pytest.fixture(scope="module")
+def phased(tmp_path_factory):
+    """A phased task whose arms rest, follow a file, and go through points; and two episodes."""
+    folder = tmp_path_factory.mktemp("phased")
+    (folder / "push.csv").write_text("t_s,c1_kPa,c2_kPa,c3_kPa\n0,1,1,1\n9,1,1,1\n")
+    text = TINY.replace('laser = "policy"', 'laser = "push"').replace(
+        'name = "look"\nendoscope = "policy"', 'name = "look"\nendoscope = "rest"\nlaser = "go"'
+    )
+    text += '[[drivers]]\nname = "push"\nschedule = "push.csv"\n'
+    text += '[[drivers]]\nname = "go"\nwaypoints = [[0.0, 0.0, 0.0, 0.0]]\n'
+    text += '[[drivers]]\nname = "unused"\nwaypoints = [[0.0, 0.0, 0.0, 0.0]]\n'
+    spec = spec_of(folder, text)
+    task = PhasedTask(LaserSupervision(CircleAblation(replace(spec.task, scene=spec.scene))), spec)
+    return spec, task, Episodes(task).seeded(0, 2)
+
+
+def test_each_arm_follows_the_controller_of_its_phase(phased):
+    """Episode 0 is in the first phase, episode 1 in the second."""
+    spec, task, state = phased
+    state = replace(state, goal=replace(state.goal, phase=torch.tensor([0, 1])))
+    controllers = PhaseControllers(spec, task, "scripted")
+    assert sorted(controllers.defined) == [("laser", "go"), ("laser", "push")]
+    actions = controllers.act(task, state, {})
+    part = state.world.arms["endoscope"]
+    rest = task.world.arms["endoscope"].first - part.command
+    torch.testing.assert_close(actions["endoscope"][0], rest[0])
+    laser = state.world.arms["laser"]
+    torch.testing.assert_close(actions["laser"][1], 1.0 - laser.command[1])
+    expert = task.script(state)["endoscope"]
+    torch.testing.assert_close(actions["endoscope"][1], expert[1])
+
+
+def test_a_schedule_of_several_runs_is_no_controller(tmp_path):
+    file = tmp_path / "two.csv"
+    file.write_text("t_s,run,c1_kPa\n0,0,1\n1,0,1\n0,1,1\n1,1,1\n")
+    with pytest.raises(InputError, match=r"two\.csv: 2 runs; expected one"):
+        Schedule(file, 1)
+
+
+def test_a_fault_after_the_end_is_no_event(phased):
+    spec, *_ = phased
+    log = made_up(measures={"phase": torch.zeros(6).numpy(), "reason": torch.zeros(6).numpy()})
+    faults = (Fault("laser", 2.0, 1), Fault("laser", 99.0, 1))
+    found = with_phase_events(replace(spec, faults=faults), log).events
+    assert [event.time_s for event in found if "fault" in event.text] == [2.0]
+
+
+def test_a_folder_of_experiments_is_that_of_its_scene(tmp_path):
+    shutil.copy(write(tmp_path), tmp_path / "second.toml")
+    assert [path.name for path in experiments_of(tmp_path)] == ["second.toml", "tiny.toml"]

@@ -1,0 +1,152 @@
+"""Tasks, environments and worlds that are asked for what cannot be; one line each."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from surgisoft.errors import InputError
+from surgisoft.surrogate.checkpoint import default_arm, save_model
+from surgisoft.tasks import registry
+from surgisoft.tasks.area_ablation import AreaAblationConfig
+from surgisoft.tasks.describe import main as describe
+from surgisoft.tasks.numpy_adapter import NumpyAdapter
+from surgisoft.tasks.parallel import parallel_env
+from surgisoft.tasks.path_following import FollowWeights
+from surgisoft.tasks.registry import config_of, make_task, with_present_names
+from surgisoft.tasks.single import BatchedEnv, SingleEnv, one_agent
+from surgisoft.tasks.world.arm import Randomisation
+from surgisoft.tasks.world.observer import AlphaBetaFilter
+from surgisoft.tasks.world.pytree import tree_map
+from surgisoft.tasks.world.random_streams import streams
+from surgisoft.tasks.world.reach import blank_mounts
+from surgisoft.tasks.world.respiration import Respiration
+from surgisoft.tasks.world.scene import only
+
+
+def said(call) -> str:
+    """The one line of the InputError that a call raises."""
+    with pytest.raises(InputError) as error:
+        call()
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Randomisation(lesions=0), "randomisation: lesions is 0, expected at least 1"),
+        (lambda: AlphaBetaFilter(gain=2.0), "observer: gain is 2.0, expected 0 to 1"),
+        (lambda: AlphaBetaFilter(drift_gain=-1.0), "observer: drift_gain is -1.0, expected 0 to 1"),
+        (lambda: Respiration(irregular=0.9), "respiration: irregular is 0.9, expected 0 to 0.5"),
+        (lambda: AreaAblationConfig(healthy_mm2=-1.0), "healthy_mm2 is -1.0, expected >= 0"),
+        (lambda: blank_mounts([]), "no arm is given; expected at least one of"),
+        (lambda: blank_mounts(["knife"]), "unknown tool 'knife'"),
+        (lambda: blank_mounts(["laser"], {"knife": "default"}), "unknown arm 'knife'"),
+        (lambda: only({}, "laser"), "arms with the tool 'laser': none; expected one"),
+        (lambda: only({"a": 1, "b": 2}, "laser"), "with the tool 'laser': a, b; expected one"),
+        (lambda: describe(["--check"]), "expected one folder of pages, such as"),
+        (lambda: make_task("track_hexagon"), "unknown task 'track_hexagon'"),
+    ],
+)
+def test_what_cannot_be_meant_is_one_line(make, message):
+    assert message in said(make)
+
+
+def test_a_weight_that_is_no_number_is_named():
+    config = config_of("track_circle")
+    wrong = FollowWeights(track=float("nan"))
+    with pytest.raises(InputError, match="task: weight of 'track' is nan, expected a finite"):
+        dataclasses.replace(config.follow, weights=wrong)
+
+
+def test_an_arm_model_without_a_length_cannot_be_mounted(tmp_path):
+    arm = default_arm()
+    arm.spec = dataclasses.replace(arm.spec, length_mm=None)
+    save_model(arm, tmp_path / "arm")
+    assert "the arm model states no length; fit it to recordings whose sidecar has length" in said(
+        lambda: blank_mounts(["laser"], {"laser": str(tmp_path / "arm")})
+    )
+
+
+@pytest.fixture(scope="module")
+def task():
+    return make_task("track_circle")
+
+
+def test_actions_and_calls_of_another_shape_are_refused(task):
+    adapter = NumpyAdapter(task)
+    assert "action of 'arm' has shape (2,), expected (3,)" in said(
+        lambda: adapter.checked({"arm": np.zeros(2)})
+    )
+    assert adapter.checked({"arm": np.zeros(3)})["arm"].dtype == np.float32
+    single, vector, several = (
+        SingleEnv("track_circle"),
+        BatchedEnv("track_circle", num_envs=2),
+        parallel_env("track_circle"),
+    )
+    assert "step before reset: call reset() first" in said(lambda: single.step(np.zeros(3)))
+    assert "step before reset: call reset() first" in said(lambda: vector.step(np.zeros((2, 3))))
+    assert "state before reset: call reset() first" in said(several.state)
+
+
+def test_one_agent_of_a_task_is_one_of_its_own(task):
+    assert "unknown agent 'laser': known are arm" in said(lambda: one_agent(task, "laser"))
+    alone = one_agent(task, "arm")
+    assert (alone.agents, alone.name, alone.steps) == (("arm",), task.name, task.steps)
+    with pytest.raises(AttributeError):
+        alone.__wrapped__  # noqa: B018  (as pickle and copy ask for what is not there)
+
+
+def test_a_task_of_another_package_is_what_it_says(monkeypatch):
+    """Stand-ins for entry points: no task, another name, one that does not load."""
+
+    class Entry:
+        """An entry point."""
+
+        def __init__(self, name, load):
+            self.name, self.value, self.load = name, "m:x", load
+
+    named_b = SimpleNamespace(steps=5, name="b")
+    own = registry.TASKS["track_circle"]
+    other = dataclasses.replace(own, build=lambda config, device: named_b)
+    loads = {"number": lambda: 5, "other": lambda: other, "broken": lambda: 1 / 0}
+    offered = {name: Entry(name, load) for name, load in loads.items()}
+    monkeypatch.setattr(registry, "_offered", lambda path: offered)
+    assert "task 'number' (m:x): is a int, expected a surgisoft.tasks.spec.TaskSpec" in said(
+        lambda: make_task("number")
+    )
+    assert "task 'other': its name is 'b', expected 'other'" in said(lambda: make_task("other"))
+    assert "task 'broken' (m:x): does not load (ZeroDivisionError: division by zero)" in said(
+        lambda: make_task("broken")
+    )
+
+
+def test_former_names_are_those_of_tables():
+    config = config_of("track_circle").follow
+    assert with_present_names(config, 5) == 5
+    assert with_present_names(config, {"recall": 3}) == {"history_steps": 3}
+    assert with_present_names(config, {"fine_weight": 2.0}) == {"weights": {"fine": 2.0}}
+
+
+def test_random_numbers_do_not_depend_on_how_they_are_drawn():
+    """Compiled code on a processor, torch elsewhere: here for a subclass of a tensor."""
+
+    class Marked(torch.Tensor):
+        """What `torch.func` puts in the place of a tensor."""
+
+    plain = streams(3, 2)
+    marked = dataclasses.replace(plain, key=plain.key.as_subclass(Marked))
+    for _ in range(3):
+        plain, one = plain.uniform(-1.0, 2.0, 4)
+        marked, other = marked.uniform(-1.0, 2.0, 4)
+        torch.testing.assert_close(one, other.as_subclass(torch.Tensor), rtol=0, atol=1e-6)
+
+
+def test_trees_keep_their_tuples():
+    tree = {"a": (torch.ones(2), torch.zeros(2)), "b": torch.ones(1)}
+    found = tree_map(lambda x: x + 1, tree)
+    assert isinstance(found["a"], tuple)
+    assert [x.tolist() for x in found["a"]] == [[2.0, 2.0], [1.0, 1.0]]

@@ -35,6 +35,7 @@ from surgisoft.surrogate.checkpoint import save_model
 from surgisoft.surrogate.fit import FitConfig, fit
 from surgisoft.tasks.base import Task
 from surgisoft.tasks.registry import config_of, make_task, with_fields
+from surgisoft.tasks.world.arm import Randomisation
 
 TASK = "circle_ablation"
 """The task that is judged."""
@@ -44,6 +45,8 @@ MINUTES_POINTS = 12_000
 """Samples of a robot's own recording: ten minutes of `mixed` at 20 Hz."""
 SIDE_BY_SIDE = 300
 """Most episodes in one batch, a count: the cost of a step hardly grows up to some hundred."""
+POSES = Randomisation.history
+"""Usual number of random pressures before an episode."""
 FIRE_MM = 0.5
 """Measured distance of the beam from its target within which it is released, mm."""
 FILTER, LEARNS = "filter", "learns"
@@ -86,6 +89,8 @@ class Study:
     """Names of the hidden effects."""
     exact: bool = True
     """Whether FCL decides about contact; else the engine of training."""
+    poses: int = POSES
+    """Random pressures, 4 s each, before an episode: observers that learn learn from them."""
     seed: int = 2000
     """Seed of the episodes, which no training has; robots that are judged together have different
     episodes of it."""
@@ -152,6 +157,8 @@ class Case:
     """Seed of the episodes."""
     exact: bool
     """Whether FCL decides about contact."""
+    poses: int
+    """Random pressures before an episode."""
 
     @property
     def name(self) -> str:
@@ -161,7 +168,9 @@ class Case:
     @property
     def about(self) -> dict[str, Any]:
         """What the results depend on."""
+        poses = {} if self.poses == POSES else {"poses": self.poses}
         return {
+            **poses,
             "policy": _identity(self.method.policy),
             "observer": self.method.observer,
             "model": self.model,
@@ -215,7 +224,7 @@ def run(study: Study, folder: Path, report: Progress) -> tuple[list[Row], list[F
         for robot in study.hidden_robots
     ]
     cases = [
-        Case(method, model, robot, hidden, episodes, study.seed, study.exact)
+        Case(method, model, robot, hidden, episodes, study.seed, study.exact, study.poses)
         for method, model, robot, hidden, episodes in jobs
     ]
     missing = [case for case in cases if not case.place(kept).is_file()]
@@ -232,8 +241,9 @@ def run(study: Study, folder: Path, report: Progress) -> tuple[list[Row], list[F
     for case in cases:
         values = case.kept(kept, partial(_absent, case))
         rows.append(Row(case.method.name, case.model, case.robot, case.hidden, **values))
-    about = {"floor": list(study.robots)}
-    floors = kept.values("floor", about, lambda: [asdict(floor(robot)) for robot in study.robots])
+    about = {"floor": list(study.robots), "poses": study.poses}
+    robots, poses = study.robots, study.poses
+    floors = kept.values("floor", about, lambda: [asdict(floor(r, poses)) for r in robots])
     return rows, [Floor(**each) for each in floors]
 
 
@@ -264,7 +274,7 @@ def _judged(cases: Sequence[Case], arm: Path | None, report: Progress) -> list[d
     that of the package.
     """
     one = cases[0]
-    task = _task(one.method.policy, arm)
+    task = _task(arm, one.poses)
     config = RigConfig(adapts=one.method.observer == LEARNS)
     place = on_rig(task, config, Robots(cases))
     policy = open_policy(one.method.policy, place)
@@ -305,9 +315,11 @@ class Robots:
         return named_rig(replace(config, seed=case.robot, hidden=hidden), trial)
 
 
-def _task(policy: str, arm: Path | None) -> Task:
+def _task(arm: Path | None, poses: int) -> Task:
     """The task with its usual rules, and the model of the package or one of the robot."""
     config: Any = with_fields(config_of(TASK), fire_mm=FIRE_MM)
+    vary = replace(config.world.randomisation, history=poses)
+    config = replace(config, world=replace(config.world, randomisation=vary))
     return make_task(TASK, config if arm is None else with_fields(config, arm=str(arm)))
 
 
@@ -345,7 +357,8 @@ def markdown(rows: list[Row], floors: list[Floor], study: Study) -> str:
         f"`{TASK}` with the beam released within {FIRE_MM} mm of its target, as measured; "
         f"{study.episodes} episodes (seed {study.seed}) on each of the robots {robots} of the "
         "virtual rig. None of them took part in a training, a fit of the package, or a choice of a "
-        "constant. Errors are true ones; "
+        f"constant. Before an episode each arm goes through {study.poses} random pressures, 4 s "
+        "each. Errors are true ones; "
         f"{'FCL' if study.exact else 'the engine of training'} decides about contact. Rates with "
         "Wilson's 95 % interval, means with a bootstrap over the robots.",
         "",

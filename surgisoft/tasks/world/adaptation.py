@@ -80,8 +80,10 @@ PROBE = 0.01
 class AdaptationPrior:
     """How large disturbances are expected to be, as standard deviations.
 
-    The values were chosen on robots 0 to 20 of the virtual rig, on robots 11, 14 and 17 with hidden
-    lags, friction and breath, too. `benchmarks/robust.py` judges on other robots.
+    The values were chosen on robots 0 to 20 of the virtual rig, on robots 11 to 20 with hidden lags,
+    friction, breath and a valve that sticks, too. With less than 0.3 kPa the error without a hidden
+    effect falls by a further 2 %, but the estimate lags by more behind a valve that comes free.
+    `benchmarks/robust.py` judges on other robots.
     """
 
     noise_mm: float = 0.08
@@ -95,7 +97,7 @@ class AdaptationPrior:
     """Further disturbance of any shape that grows with the loads, mm at full load."""
     curve_mm: float = 0.15
     """Further disturbance of any shape that grows with products of loads, mm at full load."""
-    chambers_kPa: float = 0.12
+    chambers_kPa: float = 0.3
     """Transient error of a chamber's push (friction, creep, a line), kPa."""
     shift_mm: float = 0.5
     """Transient shift of the base along each axis, mm."""

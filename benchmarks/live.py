@@ -109,6 +109,8 @@ class Change:
     """False alarms before the change."""
     judges: bool
     """Whether the reference was taken, and not refused because it repeats too little."""
+    onset_s: float | None
+    """Estimated less true time of the change [s]; None without an alarm, or after a false one."""
 
 
 def circles(minutes: float, rng: np.random.Generator) -> Protocol:
@@ -207,8 +209,9 @@ def change(robot: int, motion: str, effect: str, strength: float, folder: Path) 
         late = [alarm.at_s - CHANGE_S for alarm in charts.alarms if alarm.at_s >= CHANGE_S]
         early = len(charts.alarms) - len(late)
         delay = late[0] if late else None
+        onset = charts.alarms[0].since_s - CHANGE_S if late and not early else None
         about = robot, motion, name, effect, strength, *sizes
-        found.append(Change(*about, delay, early, judge.judges))
+        found.append(Change(*about, delay, early, judge.judges, onset))
     return found
 
 
@@ -321,6 +324,7 @@ def markdown(clean: Sequence[Clean], changes: Sequence[Change]) -> str:
             after = np.mean([c.after_mm for c in some])
         about = f"{motion} | `{effect}` | {strength:g} | {before:.3f} | {after:.3f}"
         lines.append(f"| {about} | {' | '.join(cells)} |")
+    lines += ["", *_over_all(changes)]
     early = {
         name: sum(c.early for c in changes if c.reference == name) for name in ("before", "begin")
     }
@@ -332,3 +336,35 @@ def markdown(clean: Sequence[Clean], changes: Sequence[Change]) -> str:
         "",
     ]
     return "\n".join(lines)
+
+
+def _over_all(changes: Sequence[Change]) -> list[str]:
+    """Delay and estimated moment over all changes by motion and reference."""
+    lines = [
+        "## Delay, and the estimated moment of the change",
+        "",
+        "Over all changes of the table above. Moment: estimated less true one, of the changes "
+        "that were found without a false alarm before.",
+        "",
+        "| motion | reference | found | delay: median, 90 %, s | within 4 s "
+        "| moment: median, 10 % to 90 %, s | median of its size, s |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for motion, reference in itertools.product(MOTIONS, ("before", "begin")):
+        some = [c for c in changes if c.judges and (c.motion, c.reference) == (motion, reference)]
+        if not some:
+            continue
+        delays = np.array([np.inf if c.delay_s is None else c.delay_s for c in some])
+        moments = np.array([c.onset_s for c in some if c.onset_s is not None])
+        words = "recording" if reference == "before" else f"first {CLEAN_S:.0f} s"
+        least, middle, most = (
+            np.quantile(moments, [0.1, 0.5, 0.9]) if len(moments) else [np.nan] * 3
+        )
+        size = np.median(np.abs(moments)) if len(moments) else np.nan
+        half, ninth = np.quantile(delays, [0.5, 0.9], method="lower")
+        lines.append(
+            f"| {motion} | {words} | {np.isfinite(delays).sum()} of {len(some)} | {half:.1f}, "
+            f"{ninth:.1f} | {(delays <= 4.0).sum()} | {middle:+.1f}, {least:+.1f} to {most:+.1f} "
+            f"| {size:.1f} |"
+        )
+    return [*lines, ""]

@@ -34,3 +34,8 @@ def one_line(text: str) -> str:
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> InputError:
     """InputError for a name that a registry lacks; the message lists the known names."""
     return InputError(f"unknown {kind} '{name}': known are {', '.join(sorted(known))}")
+
+
+def counted(number: int, thing: str) -> str:
+    """Number and noun of a message: `1 episode`, `2,000 episodes`."""
+    return f"{number:,} {thing}" if number == 1 else f"{number:,} {thing}s"

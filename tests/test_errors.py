@@ -2,7 +2,7 @@
 
 import io
 
-from surgisoft.errors import LONGEST, InputError
+from surgisoft.errors import LONGEST, InputError, counted
 
 
 def test_what_a_file_holds_cannot_steer_the_terminal_or_fail_to_be_printed():
@@ -18,3 +18,11 @@ def test_a_long_message_keeps_its_beginning_and_its_end():
     short = str(InputError("a.csv: " + "y" * 2000 + "; expected less"))
     assert len(short) < LONGEST
     assert short.endswith("; expected less")
+
+
+def test_a_count_agrees_with_its_noun():
+    assert [counted(n, "key point") for n in (0, 1, 2000)] == [
+        "0 key points",
+        "1 key point",
+        "2,000 key points",
+    ]

@@ -73,3 +73,11 @@ def test_every_locked_package_has_a_hash_and_the_version_of_the_constraints():
     missing = {re.sub(r"[-_.]+", "-", one.name).lower() for one in project_requirements()}
     how = "python -m benchmarks.supply_chain lock > requirements.lock"
     assert missing - set(locked) == {UNHASHED}, how
+
+
+def test_actions_of_the_workflow_are_pinned_to_commits():
+    """A tag can be moved to other code; the comment names the release of the commit."""
+    for workflow in (ROOT / ".github" / "workflows").glob("*.yml"):
+        used = re.findall(r"uses: (.*)", workflow.read_text())
+        assert used
+        assert all(re.fullmatch(r"[\w/-]+@[0-9a-f]{40}  # v\d+(\.\d+)*", one) for one in used), used

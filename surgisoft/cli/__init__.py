@@ -34,7 +34,7 @@ COMMANDS = (
     "train",
     "export",
     "evaluate",
-    "run",
+    "run_",
     "scene",
     "experiment",
     "rig",

@@ -60,7 +60,8 @@ def amend(
     anyway: Annotated[
         bool,
         typer.Option(
-            "--anyway", help="Write NEW even if the held-out error does not fall significantly."
+            "--anyway",
+            help="Write NEW even if no fall of the held-out error is claimed.",
         ),
     ] = False,
     keep_network: Annotated[
@@ -77,7 +78,8 @@ def amend(
     """Amend a model: add a physical effect and validate it on held-out data.
 
     The parameters are fitted to the first three quarters of each recording and validated on the
-    last quarter. Where the error does not fall significantly, nothing is written (exit code 1).
+    last quarter. Where the error does not fall significantly, or the model had been fitted to these
+    rows before, nothing is claimed or written (exit code 1).
     """
     check_free(json_file, "error_mm")
     check_folder(report)
@@ -131,7 +133,10 @@ def amend(
         print(f"{name}: the model had this effect already; its parameters were fitted again")
     show_parameters(result.parameters)
     if result.retuned:
-        print("the network's last layer was fitted again, which lowers the error on held-out data")
+        print(
+            "the network's last layer was fitted again, which lowers the error on motion that was "
+            "left out of that fit"
+        )
     if result.refit is not None:
         print(f"{result.refit.sentence}, with parts of the training data left out")
     show_written(written)

@@ -21,7 +21,7 @@ from surgisoft.cli.options import (
 )
 from surgisoft.cli.options import Rig as RigOption
 from surgisoft.cli.progress import progress
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, counted
 
 if TYPE_CHECKING:
     from surgisoft.measurement.recordings import Recording
@@ -248,8 +248,9 @@ def written_line(path: Path, recording: Recording, hidden: Sequence[Sequence] = 
         for name, size, *late in hidden
     )
     return (
-        f"wrote {path}: {recording.samples} {recording.kind} samples of {recording.chambers} "
-        f"chambers and {recording.key_points} key points in {len(recording.runs)} runs, "
+        f"wrote {path}: {recording.samples} {recording.kind} samples of "
+        f"{counted(recording.chambers, 'chamber')} and "
+        f"{counted(recording.key_points, 'key point')} in {counted(len(recording.runs), 'run')}, "
         f"{time} on the bench{noise}{secret}"
     )
 

@@ -70,6 +70,14 @@ def compare(
         ),
     ] = None,
     credibility: Credibility = None,
+    test: Annotated[
+        bool,
+        Option(
+            "--test",
+            help="Refuse recordings that a model was fitted to, in whole or in part: the error is "
+            "then one on data that took no part.",
+        ),
+    ] = False,
     effect_files: EffectFiles = None,
 ) -> None:
     """Compare arm models with measurements: the error, and what it depends on.
@@ -105,6 +113,7 @@ def compare(
             paired=paired,
             predictions=predictions,
             error_mm=model_error,
+            test=test,
         )
     result, rest = compared[0].result, compared[0].table
     arm = rest.model
@@ -194,7 +203,10 @@ def _show(result) -> None:
     if result.coverage is None:
         print("the model states no prediction interval")
     else:
-        print(f"{result.coverage:.1%} of key points within the model's 95 % prediction interval")
+        fit = f" ({result.rows_of_fit})" if result.in_fit else ""
+        print(
+            f"{result.coverage:.1%} of key points within the model's 95 % prediction interval{fit}"
+        )
     if result.time_shift is not None:
         low, high = result.time_shift.ci95_s
         shift = result.time_shift.seconds

@@ -189,11 +189,12 @@ def _show(found) -> None:
         return
     print(
         f"error {error.before:.4f} mm, floor {error.floor:.4f} mm, "
-        f"best achievable {error.ceiling:.4f} mm (on held-out blocks)"
+        f"best achievable {error.ceiling:.4f} mm (on {found.left_out})"
     )
     for check in found.checks:
         print(f"check: {check}")
-    print(f"{'effect':18s} {'conf.':>6s} {'alone':>7s} {'unique':>7s} {'held-out RMSE':>24s}")
+    rows = "left-out RMSE" if found.in_fit else "held-out RMSE"
+    print(f"{'effect':18s} {'conf.':>6s} {'alone':>7s} {'unique':>7s} {rows:>24s}")
     for row in found.shown:
         low, high = row.ci95
         print(

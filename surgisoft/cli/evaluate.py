@@ -8,7 +8,7 @@ import typer
 
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder, check_free, check_replay, show_written
-from surgisoft.cli.inputs import counted, warn
+from surgisoft.cli.inputs import warn
 from surgisoft.cli.options import (
     SEED_MAX,
     Arm,
@@ -25,7 +25,7 @@ from surgisoft.cli.options import (
     TaskConfig,
 )
 from surgisoft.cli.progress import progress
-from surgisoft.errors import InputError, unknown_name
+from surgisoft.errors import InputError, counted, unknown_name
 from surgisoft.files import write_json
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import typer
 
 from surgisoft.cli import INTERRUPTED, app
 from surgisoft.cli.files import check_folder, show_written
-from surgisoft.cli.inputs import counted, read_context, warn
+from surgisoft.cli.inputs import read_context, warn
 from surgisoft.cli.options import (
     Cluster,
     Credibility,
@@ -18,6 +18,7 @@ from surgisoft.cli.options import (
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
+from surgisoft.errors import counted
 
 commands = typer.Typer(
     no_args_is_help=True, help="Scripted experiments on a scene: run, check, list."
@@ -35,7 +36,8 @@ def run(
         ),
     ] = None,
     processes: Annotated[
-        int, typer.Option(min=1, max=1024, help="Processes; the results do not depend on them.")
+        int,
+        typer.Option(min=1, max=1024, help="Number of processes; the results do not depend on it."),
     ] = 1,
     cluster: Cluster = None,
     resume: Annotated[

@@ -121,5 +121,5 @@ def fit(
     for line in result.lines():
         print(line)
     print(f"wrote {output}: {result.model.summary()}")
-    following = with_effect_files(f"surgisoft compare {output} TEST.parquet --report PAGE")
+    following = with_effect_files(f"surgisoft compare {output} TEST.parquet --test --report PAGE")
     print(f"next, its error on a recording that took no part: {following}")

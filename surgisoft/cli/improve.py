@@ -105,7 +105,9 @@ def improve(
         print(f"{output} was not written")
         raise typer.Exit(NOT_CLAIMED)
     print(f"wrote {output}: {result.model.summary()}")
-    following = with_effect_files(f"surgisoft compare {model} {output} TEST.parquet --report PAGE")
+    known = result.model.fitted_rows
+    test = "TEST.parquet --test" if known is not None and known.complete else "TEST.parquet"
+    following = with_effect_files(f"surgisoft compare {model} {output} {test} --report PAGE")
     print(f"next, both on a recording that took no part: {following}")
 
 
@@ -121,7 +123,10 @@ def _show(result) -> None:
         show_parameters(result.parameters)
         fall = result.held_out
         width = max(len(name) for name, _ in result.steps) + 2
-        print(f"{'before':{width}s} {fall.before:8.4f} mm on the held-out part")
+        part = "the held-out part"
+        if fall.in_fit:
+            part = f"the last part, of which the model had been fitted to {fall.in_fit:.0%}"
+        print(f"{'before':{width}s} {fall.before:8.4f} mm on {part}")
         for name, error in result.steps:
             print(f"{'+ ' + name:{width}s} {error:8.4f} mm")
         print(f"{'floor':{width}s} {fall.floor:8.4f} mm")

@@ -98,11 +98,6 @@ def read_context(path: Path | None):
     return load_context(path)
 
 
-def counted(number: int, thing: str) -> str:
-    """Number and noun: `1 episode`, `2,000 episodes`."""
-    return f"{number:,} {thing}" if number == 1 else f"{number:,} {thing}s"
-
-
 def warn_all(notes: Iterable[str]) -> None:
     """Print each note of a result as a line of warning."""
     for note in notes:

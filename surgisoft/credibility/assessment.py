@@ -158,6 +158,12 @@ class Assessment:
     """Rows of the comparison, for the drawings."""
 
     @property
+    def rows_of_fit(self) -> str:
+        """Which comparators the model was fitted to, so that they are no test; else empty."""
+        known = [f"{100 * c.in_fit:.0f} % of {c.name}" for c in self.comparators if c.in_fit]
+        return f"the model was fitted to {', '.join(known)}" if known else ""
+
+    @property
     def passed(self) -> bool | None:
         """Whether all criteria are met; None where the user gives none."""
         return all(each.passed for each in self.criteria) if self.criteria else None
@@ -172,7 +178,12 @@ class Assessment:
             f"{body.uncertainty_mm:.3g} mm (95 %): the model's error lies between {low:.3g} and "
             f"{high:.3g} mm; area metric {body.area_mm:.3g} mm"
         )
-        if not body.resolved:
+        if self.rows_of_fit:
+            text = (
+                f"no validation: {self.rows_of_fit}; E there {body.error_mm:.3g} mm, U_val "
+                f"{body.uncertainty_mm:.3g} mm (95 %), area metric {body.area_mm:.3g} mm"
+            )
+        elif not body.resolved:
             text += "; E is within U_val, so this comparison cannot resolve the model's error"
         if self.passed is None:
             return f"{text}; no limits are given"
@@ -190,6 +201,9 @@ class Assessment:
                 "statement": STATEMENT,
                 "sentence": self.sentence,
                 "passed": self.passed,
+                "took_no_part": None
+                if any(each.in_fit is None for each in self.comparators)
+                else not self.rows_of_fit,
                 "question_of_interest": context.question,
                 "context_of_use": context.use,
                 "model_risk": asdict(context.risk) | {"level": context.risk.level},
@@ -265,10 +279,11 @@ def assess(
         progress("applicability")
         validated = [states_of(recording, model.spec.actuation) for recording in recordings]
         inside = applicability(validated, states, _length(table))
+    comparators = tuple(_comparator(each, context, table) for each in recordings)
     return Assessment(
         context=context,
         model=model.summary(),
-        comparators=tuple(_comparator(each, context, table) for each in recordings),
+        comparators=comparators,
         inputs=inputs_of(model, recordings),
         points=points,
         error_ci95_mm=comparison.rmse_ci95_mm,
@@ -281,7 +296,7 @@ def assess(
         outcomes=tuple(outcomes),
         agreement=agreement(episodes.values()),
         software=software(),
-        criteria=criteria_of(context, points, inside),
+        criteria=criteria_of(context, points, inside, any(each.in_fit for each in comparators)),
         table=table,
     )
 
@@ -312,27 +327,35 @@ def point_errors(
 
 
 def criteria_of(
-    context: Context, points: Sequence[PointError], inside: Applicability | None
+    context: Context,
+    points: Sequence[PointError],
+    inside: Applicability | None,
+    fitted: bool = False,
 ) -> tuple[Criterion, ...]:
     """The user's limits, each with the value that it is compared with.
 
-    The comparison error counts with its uncertainty: the upper end of E ± U_val.
+    The comparison error counts with its uncertainty: the upper end of E ± U_val. fitted: whether
+    the model was fitted to some of the rows; criteria on the error are then not met, because it is
+    known on no data that took no part.
     """
     limits, found = context.limits, []
     measured = [each for each in points[:-1] if np.isfinite(each.error_mm)]
+    unknown = float("nan")
+    why = ", on data that took no part in the fit" if fitted else ""
     if limits.error_mm is not None:
         worst = max(measured, key=lambda each: each.interval_mm[1])
         name = f"E + U_val of every key point (largest: {worst.label})"
-        found.append(Criterion(name, worst.interval_mm[1], limits.error_mm, "mm"))
+        value = unknown if fitted else worst.interval_mm[1]
+        found.append(Criterion(name + why, value, limits.error_mm, "mm"))
     if limits.tip_error_mm is not None:
         tip = points[-2]
-        found.append(
-            Criterion("E + U_val of the tip", tip.interval_mm[1], limits.tip_error_mm, "mm")
-        )
+        value = unknown if fitted else tip.interval_mm[1]
+        found.append(Criterion(f"E + U_val of the tip{why}", value, limits.tip_error_mm, "mm"))
     if limits.area_mm is not None:
         worst = max(measured, key=lambda each: each.area_mm)
         name = f"area metric of every key point (largest: {worst.label})"
-        found.append(Criterion(name, worst.area_mm, limits.area_mm, "mm"))
+        value = unknown if fitted else worst.area_mm
+        found.append(Criterion(name + why, value, limits.area_mm, "mm"))
     if limits.applicable is not None:
         share = float("nan") if inside is None else inside.whole
         name = "share of the scenario's states inside the validated domain"
@@ -419,7 +442,7 @@ def _comparator(recording: Recording, context: Context, table: ResidualTable) ->
         rows=recording.samples,
         seconds=seconds,
         range=tuple(zip(signal.min(0).tolist(), signal.max(0).tolist(), strict=True)),
-        in_fit=None if known is None else known.share_of(history),
+        in_fit=None if known is None else known.certain_part_of(history),
     )
 
 

@@ -22,7 +22,8 @@ HOW = (
     "RMS distance; the parts count as independent. The error of the model then lies within E ± "
     "U_val at 95 % (V&V 20-2009). Where E is smaller than U_val the comparison "
     "cannot tell the model's error from these uncertainties. A part that is not known counts as "
-    "zero, so that U_val is then too small.\n\n"
+    "zero, so that U_val is then too small. On recordings that the model was fitted to, in whole "
+    "or in part, E is no error of a validation, and no criterion on it is met.\n\n"
     "The area metric is the area between the distribution functions of predicted and measured "
     "coordinates (Roy & Oberkampf 2011), root of the sum of squares over x, y and z. It compares "
     "how often places come, not when, and it has the unit of the quantity. Over the body it is the "
@@ -235,8 +236,8 @@ def _comparators(found: Assessment) -> Section:
     header = ["recording", "robot", "date", "rows", "length", "actuation", "rows in the fit"]
     hashes = [(each.name, each.sha256) for each in found.comparators]
     parts: list = [Table([*header, "note"], rows), Table(["recording", "SHA-256"], hashes)]
-    if any(each.in_fit for each in found.comparators):
-        parts.append(Text("Rows that the model was fitted to are no independent test of it."))
+    if found.rows_of_fit:
+        parts.append(Text(f"{found.rows_of_fit[:1].upper()}{found.rows_of_fit[1:]}."))
     return Section("Comparators", parts)
 
 

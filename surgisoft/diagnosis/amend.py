@@ -18,7 +18,7 @@ from surgisoft.diagnosis.data_quality import FAR_ROWS, far_share
 from surgisoft.diagnosis.estimation.effects import fit_effects
 from surgisoft.diagnosis.estimation.intervals import Parameter
 from surgisoft.diagnosis.estimation.network import retune
-from surgisoft.diagnosis.inputs import LEAST_KNOWN, Model, Recordings, open_inputs
+from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
 from surgisoft.diagnosis.other_models import open_model, refuse_predictions
 from surgisoft.diagnosis.pairs import LEAST_SHARE, Change, Paired, before_and_after
 from surgisoft.diagnosis.refit import Refit, apart_mm, can_hide, fit_together, refit_reason
@@ -46,7 +46,7 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Fall:
-    """The error of two models on the same rows, which were not used in their fits."""
+    """The error of two models on the same rows."""
 
     before: float
     """RMS distance of a key point by the old model, mm."""
@@ -66,11 +66,18 @@ class Fall:
     """Probability that noise and the network's own error alone would have been fitted by so much of
     the effects; None where that was not tested."""
 
-    in_fit: float = 0.0
-    """Share of the rows that the old model had been fitted to: there its error is no test."""
+    in_fit: float | None = 0.0
+    """Share of the rows that the old model had been fitted to: there its error is no test. None
+    where that is not known."""
 
     @property
     def claimed(self) -> bool:
+        """Whether a fall on data that took no part is claimed: it is significant, and the old model
+        had been fitted to none of the rows."""
+        return self.significant and not self.in_fit
+
+    @property
+    def significant(self) -> bool:
         """Whether the fall is significant, large enough to matter, and due to the effects.
 
         An effect also lowers the error of an arm that lacks nothing, where it happens to resemble
@@ -90,11 +97,16 @@ class Fall:
     @property
     def sentence(self) -> str:
         """The fall in words."""
-        low, high = self.ci95
-        part = f", {self.in_fit:.0%} of which the model had been fitted to," if self.in_fit else ""
-        numbers = (
-            f"{self.before:.3f} to {self.after:.3f} mm on held-out data{part} "
-            f"(fall {self.fall:.3f} mm, 95 % {low:.3f} to {high:.3f}; floor {self.floor:.3f} mm)"
+        low = self.ci95[0]
+        if self.in_fit and self.significant:
+            return (
+                "no fall on data that took no part is claimed, because the model had been fitted "
+                f"to {self.in_fit:.0%} of the held-out rows: {self.numbers('there')}"
+            )
+        numbers = self.numbers(
+            f"on rows of which the model had been fitted to {self.in_fit:.0%}"
+            if self.in_fit
+            else "on held-out data"
         )
         if self.claimed:
             return f"error {numbers}"
@@ -106,6 +118,19 @@ class Fall:
                 f"may be the network's own error, which the effect resembles (p {self.p_value:.2g})"
             )
         return f"no fall of the error is claimed: {numbers} {why}"
+
+    def numbers(self, where: str) -> str:
+        """Both errors and the fall; where: on which rows, in words."""
+        low, high = self.ci95
+        return (
+            f"{self.before:.3f} to {self.after:.3f} mm {where} "
+            f"(fall {self.fall:.3f} mm, 95 % {low:.3f} to {high:.3f}; floor {self.floor:.3f} mm)"
+        )
+
+    def to_json(self) -> dict:
+        """Plain values; `took_no_part`: whether the old model had been fitted to none of them."""
+        apart = None if self.in_fit is None else not self.in_fit
+        return asdict(self) | {"ci95": list(self.ci95), "took_no_part": apart}
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +156,7 @@ class Amendment:
     effects: tuple[str, ...]
     """The effects asked for."""
     refitted: tuple[str, ...]
-    """Those that the model had before: their parameters were fitted anew."""
+    """Effects that the model had before and whose parameters were fitted again."""
     parameters: tuple[Parameter, ...]
     """The fitted parameters in physical units."""
     held_out: Fall
@@ -164,14 +189,17 @@ class Amendment:
 
         A network that is trained on together with the effects does not see the held-out rows. If
         the given model had been fitted to some of them, its error there is no test, and what counts
-        is the network that was trained on from the same weights for as long without the effects.
+        is the network that was trained on from the same weights for as long without the effects:
+        that comparison is claimed, and no error on data that took no part.
         """
-        return self.alone.claimed and (self.held_out.claimed or self._seen_before)
+        if self._seen_before:
+            return self.alone.significant
+        return self.alone.claimed and self.held_out.claimed
 
     @property
     def _seen_before(self) -> bool:
         """Whether a joint fit is compared with a model that had been fitted to held-out rows."""
-        return self.refit is not None and self.held_out.in_fit > 0
+        return self.refit is not None and bool(self.held_out.in_fit)
 
     @property
     def sentence(self) -> str:
@@ -193,11 +221,14 @@ class Amendment:
     def _together(self) -> str:
         """The outcome of a joint fit in words."""
         if self._seen_before:
+            head = "error" if self.alone.significant else "no fall of the error is claimed:"
+            where = "on rows that neither training saw"
             return (
-                f"{self.alone.sentence}, fitted together with the network, compared with the "
-                "network alone, trained for as many epochs from the same weights; the given "
-                f"model, which had been fitted to {self.held_out.in_fit:.0%} of these rows, has "
-                f"{self.held_out.before:.3f} mm there"
+                f"{head} {self.alone.numbers(where)}, fitted together with the network, compared "
+                "with the network alone, trained for as many epochs from the same weights; the "
+                f"given model, which had been fitted to {self.held_out.in_fit:.0%} of these rows, "
+                f"has {self.held_out.before:.3f} mm there, so none of these is an error on data "
+                "that took no part"
             )
         network = (
             f"the network alone, trained for as many epochs, reaches {self.alone.before:.3f} mm"
@@ -217,17 +248,16 @@ class Amendment:
             "refitted": list(self.refitted),
             "claimed": self.claimed,
             "sentence": self.sentence,
-            "error_mm": asdict(held_out) | {"ci95": list(held_out.ci95)},
-            "error_effects_alone_mm": asdict(self.alone) | {"ci95": list(self.alone.ci95)},
-            "error_open_mm": asdict(training) | {"ci95": list(training.ci95)},
+            "error_mm": held_out.to_json(),
+            "error_effects_alone_mm": self.alone.to_json(),
+            "error_open_mm": training.to_json(),
             "parameters": [parameter.to_json() for parameter in self.parameters],
             "network_retuned": self.retuned,
             "refit": None if self.refit is None else self.refit.to_json(),
             "notes": list(self.notes),
             "seconds": self.seconds,
             "change": self.change and self.change.to_json(),
-            "error_model_mm": self.model_error
-            and asdict(self.model_error) | {"ci95": list(self.model_error.ci95)},
+            "error_model_mm": self.model_error and self.model_error.to_json(),
         }
 
 
@@ -316,7 +346,6 @@ def amend(
         held_out = whole = sealed.opened(plain).final_check()
         # Both start from the same weights, whatever these were fitted to.
         alone = fall_of(held_out.with_model(joint.alone), held_out.with_model(better))
-        alone = replace(alone, in_fit=0.0)
         far = far_share(problem.pressure, held_out.pressure)
         if far > FAR_ROWS:
             notes = (
@@ -331,14 +360,14 @@ def amend(
         fitted = fit_effects(problem, names)
         parameters, refitted = fitted.parameters, fitted.refitted
         better, retuned = fitted.model, False
-        shown_by_training = fall_of(problem, problem.with_model(better), fitted.p_value).claimed
+        shown_by_training = fall_of(problem, problem.with_model(better), fitted.p_value).significant
         if retune_network and shown_by_training:
             tell("re-tuning the network")
             # Tuned to what was measured: the network's own error is not in a paired difference.
             rows = plain.training()
             tried = retune(better, rows)
             pair = rows.with_model(better), rows.with_model(tried.model)
-            if tried.kept and fall_of(*pair).claimed:
+            if tried.kept and fall_of(*pair).significant:
                 better, retuned = tried.model, True
         tell("evaluating on the held-out part")
         held_out = whole = (opened := sealed.opened(plain)).final_check()
@@ -377,8 +406,6 @@ def fall_of(before: Problem, after: Problem, p_value: float | None = None) -> Fa
     p_value: of the effects' amplitudes, see `Fall.p_value`.
     """
     seen = np.isfinite(before.residual).all(2).sum(1)
-    known = before.model.fitted_rows
-    share = 0.0 if known is None else known.share_of(before.history)
     sums = [
         block_sums(np.nansum(np.square(problem.residual), axis=(1, 2)), before.block)
         for problem in (before, after)
@@ -395,7 +422,7 @@ def fall_of(before: Problem, after: Problem, p_value: float | None = None) -> Fa
         rows=len(before.index),
         blocks=len(count),
         p_value=p_value,
-        in_fit=0.0 if share < LEAST_KNOWN else share,
+        in_fit=before.in_fit,
     )
 
 

@@ -15,6 +15,7 @@ from surgisoft.diagnosis.inputs import (
     Model,
     Recordings,
     open_inputs,
+    refuse_rows_of_fit,
     with_known_residuals,
 )
 from surgisoft.diagnosis.other_models import open_model
@@ -124,6 +125,9 @@ class Comparison:
     """How far the recordings differ from those before a change; None where none were given."""
     change_axes: tuple[AxisShare, ...] = ()
     """How much of the paired difference each axis explains, most first."""
+    in_fit: float | None = None
+    """Share 0..1 of the rows that the model was fitted to, where its error is no test of it; None
+    where the model does not say."""
 
     @property
     def explainable(self) -> float | None:
@@ -150,6 +154,8 @@ class Comparison:
         """Error, noise floor, best achievable error, and what the error depends on."""
         noise = self.floor.rmse_mm
         text = f"error {_mm(self.rmse_mm)}, floor {'unknown' if noise is None else _mm(noise)}"
+        if self.in_fit:
+            text = f"{self.rows_of_fit}; {text}"
         if self.change is not None:
             text = f"{self.change.sentence}; {text}"
         if noise is not None and self.rmse_mm <= AT_FLOOR * noise:
@@ -160,6 +166,13 @@ class Comparison:
         what = "error" if noise is None else "excess"
         text += f": {100 * (self.explainable or 0):.0f} % of the {what} is explainable"
         return f"{text}; {self._depends()}"
+
+    @property
+    def rows_of_fit(self) -> str:
+        """That the error is no test, because the model was fitted to these rows; else empty."""
+        if not self.in_fit:
+            return ""
+        return f"no test of the model, which was fitted to {self.in_fit:.0%} of these rows"
 
     def _depends(self) -> str:
         main = [f"{a.axis} ({100 * a.share:.0f} %)" for a in self.main_axes]
@@ -182,6 +195,7 @@ class Comparison:
             "ceiling_mm": top and top["rmse_mm"],
             "ceiling_ci95_mm": top and top["ci95_mm"],
             "explainable": self.explainable,
+            "took_no_part": None if self.in_fit is None else not self.in_fit,
         }
         return json_safe(values)
 
@@ -196,6 +210,7 @@ def compare(
     paired: Paired = "auto",
     predictions: Iterable[str | Path] | None = None,
     error_mm: float | None = None,
+    test: bool = False,
 ) -> tuple[Comparison, ResidualTable]:
     """Evaluate a model on recordings; both may be given by their paths.
 
@@ -211,9 +226,13 @@ def compare(
     for `diagnose`, which takes it into account for the best achievable error. before: recordings
     from before a change; the comparison then also says how far the two sets differ (`pairs`), by
     the paired difference where both have the same actuation; paired: as for `diagnose`.
+    test: raise InputError where the model was fitted to some of the recordings, or keeps no record
+    of its fit, so that the error is one on data that took no part.
     """
     model, recordings, before = open_model(model, recordings, before, predictions, error_mm)
     model, recordings, notes = open_inputs(model, recordings, sized=False)
+    if test:
+        refuse_rows_of_fit(model, recordings)
     wrong = find_setup_faults(model, recordings) if part == "all" else None
     if wrong is None:
         check_fits(model.spec, recordings)
@@ -265,6 +284,7 @@ def compare(
             setup=None if wrong is None else wrong.sentence,
             change=None if both is None else both.change,
             change_axes=changed,
+            in_fit=problem.in_fit,
         ),
         table,
     )

@@ -39,12 +39,13 @@ from surgisoft.diagnosis.evidence import Evidence, evidence_of
 from surgisoft.diagnosis.inputs import (
     Model,
     Recordings,
+    held_out_in_fit,
     open_inputs,
     with_known_residuals,
 )
 from surgisoft.diagnosis.other_models import open_model
 from surgisoft.diagnosis.pairs import BeforeAfter, Change, ChangeTrack, Paired, before_and_after
-from surgisoft.diagnosis.refit import Refit, refit_reason
+from surgisoft.diagnosis.refit import Refit, can_hide, refit_reason
 from surgisoft.diagnosis.refit import refit as fit_candidates_together
 from surgisoft.diagnosis.residuals import Problem, Sealed, residual_table
 from surgisoft.diagnosis.selection import (
@@ -97,6 +98,11 @@ MENTIONED = {
     "surrogate_undertrained": "the model is off",
 }
 """Statements that the sentence of "cannot tell" mentions, in words."""
+
+HELD_OUT = "held-out blocks"
+"""Blocks of time that took part in no fit, in words."""
+LEFT_OUT = "blocks left out of the effects' fit (the model itself was fitted to these recordings)"
+"""Blocks of time of recordings that the model was fitted to, which are no held-out data."""
 
 Progress = Callable[[str], None]
 """Called with what is being done."""
@@ -198,6 +204,13 @@ class Diagnosis:
     """All statements that could be made with these probabilities, worth most first."""
     refit: Refit | None = None
     """What candidates did that were fitted together with the network; None where none was."""
+    in_fit: float | None = None
+    """Share 0..1 of the rows looked at that the model was fitted to; None where it does not say."""
+
+    @property
+    def left_out(self) -> str:
+        """The rows that errors with an effect are from, in words."""
+        return LEFT_OUT if self.in_fit else HELD_OUT
 
     @property
     def shown(self) -> tuple[Ranked, ...]:
@@ -262,7 +275,7 @@ def diagnose(
     report = progress or (lambda text: None)
     model, recordings, before = open_model(model, recordings, before, predictions, error_mm)
     model, recordings, notes = open_inputs(model, recordings, sized=not setup_tests)
-    recordings = Sealed(recordings).training
+    whole, recordings = recordings, Sealed(recordings).training
     if setup_tests:
         report("set-up")
         wrong = find_setup_faults(model, recordings)
@@ -299,7 +312,24 @@ def diagnose(
         result = with_refit(result, joint, problem)
     if result.verdict.kind == "unknown_effect":
         result = with_axis(result, problem)
+    if result.next_command.startswith("surgisoft amend"):
+        unknown = not held_out_in_fit(model, whole, table.held_out)
+        result = replace(result, next_command=amend_command(result, unknown))
     return replace(result, notes=notes, seconds=time.perf_counter() - begin)
+
+
+def amend_command(result: Diagnosis, unknown: bool) -> str:
+    """The command that adds the named effects; unknown: whether the model has not been fitted to
+    the rows that `amend` holds out.
+
+    On rows of the fit no fall is claimed, unless effects and network are fitted together.
+    """
+    command = result.next_command
+    if unknown or "--refit always" in command:
+        return command
+    if all(map(can_hide, result.verdict.effects)):
+        return f"{command} --refit always"
+    return command.replace("{data}", "OTHER_REC")
 
 
 def findings_of(
@@ -424,10 +454,12 @@ def result_of(found: Findings, decision: Decision | None = None) -> Diagnosis:
     best = best_achievable(problem, found.box, found)
     evidence = evidence_of(found)
     decision = decision or decide(evidence)
+    in_fit = problem.in_fit
+    where = LEFT_OUT if in_fit else HELD_OUT
     kind, effects, sure = decision.kind, decision.effects, decision.confidence
     levels = ErrorLevels(problem.rmse_mm, problem.floor_mm, best.rmse_mm)
     ranking = tuple(_ranked(found, score, decision) for score in _order(found, decision))
-    sentence = sentence_of(decision, levels, _reached(found, effects, kind))
+    sentence = sentence_of(decision, levels, _reached(found, effects, kind), where)
     others = _instead(evidence) if kind == "several" else ()
     if others:
         sentence += f"; {' or '.join(others)} would do as well in the place of one of them"
@@ -445,6 +477,7 @@ def result_of(found: Findings, decision: Decision | None = None) -> Diagnosis:
         probabilities=decision.probabilities,
         statements=decision.statements,
         next_command=next_command(decision),
+        in_fit=in_fit,
     )
 
 
@@ -536,25 +569,28 @@ def _share(value: float) -> float:
     return float(min(max(value, 0.0), 1.0))
 
 
-def sentence_of(decision: Decision, levels: ErrorLevels, reached: float) -> str:
-    """The verdict in words. reached: held-out error with the named effects, mm."""
+def sentence_of(
+    decision: Decision, levels: ErrorLevels, reached: float, where: str = HELD_OUT
+) -> str:
+    """The verdict in words. reached: error with the named effects on blocks that these were not
+    fitted to, mm; where: these blocks in words."""
     kind, effects, sure = decision.kind, decision.effects, decision.confidence
     error = f"error {levels.before:.3g} mm, floor {levels.floor:.3g} mm"
     if kind == "identified":
         return (
             f"{effects[0]} is missing (confidence {sure:.2f}): with it {reached:.3g} mm remain on "
-            f"held-out blocks; {error}"
+            f"{where}; {error}"
         )
     if kind == "several":
         together = " and ".join(effects)
         return (
             f"{together} are missing (confidence {sure:.2f} in both): with them "
-            f"{reached:.3g} mm remain on held-out blocks; {error}"
+            f"{reached:.3g} mm remain on {where}; {error}"
         )
     if kind == "ambiguous":
         return (
             f"cannot tell {' from '.join(effects)} with these recordings (confidence {sure:.2f} "
-            f"that it is one of them): each would leave about {reached:.3g} mm on held-out blocks; "
+            f"that it is one of them): each would leave about {reached:.3g} mm on {where}; "
             f"{error}"
         )
     if kind == "unknown_effect":

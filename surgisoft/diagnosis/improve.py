@@ -97,7 +97,14 @@ class Improvement:
 
     @property
     def claimed(self) -> bool:
-        """Whether something was added and the error fell by it."""
+        """Whether something was added and the error fell by it.
+
+        Where the given model had been fitted to held-out rows, its error there is smaller than on
+        data that took no part. A network that was trained on together with effects is compared with
+        it all the same, and with the network alone in its round; any other fall is not claimed.
+        """
+        if self.held_out.in_fit and any(done.together for done in self.rounds):
+            return bool(self.steps) and self.held_out.significant
         return bool(self.steps) and self.held_out.claimed
 
     @property
@@ -105,7 +112,14 @@ class Improvement:
         """The outcome in words."""
         if not self.steps:
             return f"nothing was added: {self.rounds[-1].sentence}"
-        return f"{' + '.join(name for name, _ in self.steps)}: {self.held_out.sentence}"
+        names, fall = " + ".join(name for name, _ in self.steps), self.held_out
+        if self.claimed and fall.in_fit:
+            where = f"on rows of which the given model had been fitted to {fall.in_fit:.0%}"
+            return (
+                f"{names}: error {fall.numbers(where)}, fitted together with the network; none of "
+                "these is an error on data that took no part"
+            )
+        return f"{names}: {fall.sentence}"
 
     def to_json(self) -> dict:
         """Plain values, as `improve --json` writes them."""
@@ -114,7 +128,7 @@ class Improvement:
             "claimed": self.claimed,
             "effects": [name for name, _ in self.steps if name != NETWORK],
             "network_retuned": any(name == NETWORK for name, _ in self.steps),
-            "error_mm": asdict(self.held_out) | {"ci95": list(self.held_out.ci95)},
+            "error_mm": self.held_out.to_json(),
             "rounds": [asdict(r) | {"rivals": list(r.rivals)} for r in self.rounds],
             "parameters": [parameter.to_json() for parameter in self.parameters],
             "notes": list(self.notes),
@@ -201,7 +215,7 @@ def improve(
                     problem.with_model(each) for each in (fitted.alone, fitted.model)
                 )
                 doubt = _idle(name, fall_of(alone, together_))
-            if doubt and fall.claimed and isinstance(fitted, Fitted):
+            if doubt and fall.significant and isinstance(fitted, Fitted):
                 tried = fit_plausible(before, fitted, [*added, name], name)
                 if tried is not None:
                     less = fall_of(before, problem.with_model(tried.model))
@@ -277,7 +291,7 @@ def _as_good(held: Fall, free: Fall) -> bool:
 
 def _doubt(name: str, fall: Fall, parameters: tuple[Parameter, ...]) -> str:
     """Why an effect is not added, whatever the diagnosis says; empty where it may be."""
-    if not fall.claimed:
+    if not fall.significant:
         return f"{name}, fitted through the whole model, does not lower the error"
     wrong = [p for p in parameters if p.effect == name and not p.may_be_plausible]
     if not wrong:
@@ -294,7 +308,7 @@ def _idle(name: str, fall: Fall) -> str:
 
     fall: from the network trained for as many epochs without the effect to the network with it.
     """
-    if fall.claimed:
+    if fall.significant:
         return ""
     return f"the network alone, trained for as many epochs as with {name}, lowers the error as far"
 

@@ -3,17 +3,17 @@
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from surgisoft.diagnosis.other_models import notes_of
 from surgisoft.diagnosis.residuals import Problem, Sealed, residual_table
 from surgisoft.diagnosis.weight import under_weight
+from surgisoft.errors import InputError
 from surgisoft.measurement.histories import check_fits, history_of, outside_range
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.training_residuals import TrainingResiduals
-
-LEAST_KNOWN = 0.02
-"""Least share of a recording's rows in the fit of a model that is reported."""
 
 Model = ArmModel | str | Path | Callable
 """A model, its folder, a callable, the name of one, or a file of predictions (`open_model`)."""
@@ -44,18 +44,52 @@ def part_in_fit(model: ArmModel, recordings: list[Recording]) -> tuple[str, ...]
 
     Errors there are errors of the fit and no test of the model.
     """
+    return tuple(
+        f"{recording.name}: the model was fitted to {100 * share:.0f} % of its rows: the error "
+        "there is no test; use recordings that took no part in the fit"
+        for recording, share in zip(recordings, shares_in_fit(model, recordings), strict=True)
+        if share
+    )
+
+
+def shares_in_fit(model: ArmModel, recordings: Iterable[Recording]) -> list[float]:
+    """Share 0..1 of the rows of each recording that the model was fitted to.
+
+    Rows are recognised by their content (`FittedRows`). 0 also where the model keeps no record.
+    """
+    known = model.fitted_rows
+    return [
+        0.0 if known is None else known.part_of(history_of([each], model.spec.actuation))
+        for each in recordings
+    ]
+
+
+def refuse_rows_of_fit(model: ArmModel, recordings: Iterable[Recording]) -> None:
+    """Raise InputError unless the recordings are known to have taken no part in the model's fit."""
+    recordings = list(recordings)
+    for recording, share in zip(recordings, shares_in_fit(model, recordings), strict=True):
+        if share:
+            raise InputError(
+                f"{recording.label}: the model was fitted to {100 * share:.0f} % of its rows, "
+                "expected a recording that took no part in the fit; give another one, or leave "
+                "out --test to see the error of the fit"
+            )
+    if model.fitted_rows is None or not model.fitted_rows.complete:
+        raise InputError(
+            "the model keeps no record of all rows that it was fitted to, expected one that does "
+            "for a test: whether the recordings took no part cannot be shown; leave out --test"
+        )
+
+
+def held_out_in_fit(model: ArmModel, recordings: list[Recording], held_out: np.ndarray) -> float:
+    """Share 0..1 of the held-out rows (N,) bool of recordings that the model was fitted to.
+
+    Nothing but the hash of these rows is looked at.
+    """
     known = model.fitted_rows
     if known is None:
-        return ()
-    notes = []
-    for recording in recordings:
-        share = known.share_of(history_of([recording], model.spec.actuation))
-        if share >= LEAST_KNOWN:
-            notes.append(
-                f"{recording.name}: the model was fitted to {100 * share:.0f} % of its rows: the "
-                "error there is no test; use recordings that took no part in the fit"
-            )
-    return tuple(notes)
+        return 0.0
+    return known.part_of(history_of(recordings, model.spec.actuation), held_out)
 
 
 def identification_problem(

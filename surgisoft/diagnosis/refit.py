@@ -30,7 +30,6 @@ from surgisoft.diagnosis.data_quality import FAR_ROWS, far_share
 from surgisoft.diagnosis.estimation.effects import fit_effects, shrink, starts
 from surgisoft.diagnosis.estimation.intervals import Parameter
 from surgisoft.diagnosis.estimation.nuisance import kinds
-from surgisoft.diagnosis.inputs import LEAST_KNOWN
 from surgisoft.diagnosis.residuals import TOGETHER, Problem
 from surgisoft.diagnosis.statistics import (
     block_interval,
@@ -754,8 +753,7 @@ def apart_mm(problem: Problem, effects: Iterable[str], config: RefitConfig = REF
     make it better. None where the network was fitted to some of the rows, so that its error there
     is no test, and where a part alone cannot be fitted.
     """
-    known = problem.model.fitted_rows
-    if known is not None and known.share_of(problem.history) >= LEAST_KNOWN:
+    if problem.in_fit:
         return None
     names, split = list(dict.fromkeys(effects)), Split.of(problem, config)
     square = 0.0

@@ -482,6 +482,15 @@ class Problem:
         return self.table.history
 
     @property
+    def in_fit(self) -> float | None:
+        """Share 0..1 of the part's rows that the model was fitted to; None where it does not say.
+
+        Errors on rows of the fit are no errors on data that took no part in it.
+        """
+        known = self.model.fitted_rows
+        return None if known is None else known.certain_part_of(self.history)
+
+    @property
     def noise_mm(self) -> np.ndarray:
         """(n,) RMS noise of each key point's distance, mm."""
         return self.table.noise_mm

@@ -70,7 +70,7 @@ def under_weight(model: ArmModel, recordings: list[Recording]) -> tuple[ArmModel
 
 
 def _without_direction(model: ArmModel) -> ArmModel:
-    """The same model, whose loads may have any direction."""
+    """A copy of the model whose loads may have any direction."""
     spec = replace(model.spec, gravity=None)
     return model.replace(spec=spec)
 

@@ -46,9 +46,21 @@ heavier tails than a normal distribution. Ten minutes hold some fifty independen
 part, and hours hold rarer ones; so no independent value may add more than h / 3, and what comes
 within three seconds no more than h / 2.
 
+A CUSUM of many small steps is slow where the error is large at once, so a Shewhart chart stands
+beside it (combined Shewhart-CUSUM: Lucas 1982). Its value is the mean square of the level over all
+components, and the alarm is raised where that was, in every block of two seconds,
+
+    mean(y^2 / s^2) > max(lambda^2, 4 q)   while the arm moves (sum of 1 / T at least 1 / 2),
+
+q the largest value of the same in the reference, each part judged by the others: an error twice as
+large as the reference's largest, in two seconds without a pause. On the resampled reference it
+raises no alarm by construction, so it takes nothing of the rate that h is set for.
+
 A reference says nothing about motions that are not in it: a network errs more in the corners of its
 range. A block counts only where the reference came at least twice to an actuation, and a change of
 it since the block before, within 15 % of the actuation's range; elsewhere the charts stand still.
+They also stand still while less than half of the last half minute was such motion: a chart sums
+over a time, and what it sums there is mostly of ways into and out of the reference.
 A reference of which less than two thirds are like other parts of it shows no error that returns:
 nothing is judged by it.
 """
@@ -81,6 +93,10 @@ LEAST_REPEATED = 2 / 3
 """Least share of a reference whose motions its other parts cover. On the robots 200, 201 and 203 it
 was 0.81 to 1.00 in a minute of a repeated task and 0.69 to 0.87 in ten minutes of the protocol
 `mixed`, but 0.34 to 0.47 in two minutes of that protocol, with which 10 of 11 false alarms came."""
+RECENT_S, LEAST_RECENT = 30.0, 0.5
+"""Time [s] of which at least this share must be motion of the reference for a block to count. On
+the robots 201 to 203, with two minutes of `mixed` as reference, 4 false alarms in 0.54 h became
+none in 0.35 h; 10 s left one."""
 TURN = 0.01
 """Least change from block to block that turns a chamber's direction, in half ranges: more than the
 noise of a pressure sensor."""
@@ -110,6 +126,14 @@ MOST_MOVE, MOVE_S = 1 / 2, 3.0
 move have one cause, such as a way that the reference does not show, and alone raise no alarm."""
 CHARTS = 3
 """Charts of each component."""
+SUDDEN_S = 2.0
+"""Time for which an error must be large without a pause to raise an alarm at once [s]: longer than
+a marker that jumps, or one fast move."""
+SUDDEN_WORTH = 0.5
+"""Independent values of the slow part that this time must hold at least [-]: an error that stands
+still while the arm does is one value, however large."""
+SUDDEN_TIMES = 2.0
+"""How many times as large as the largest of the reference it must be [-]."""
 RISEN = 0.5
 """Share of the threshold above which a chart takes part in the estimate of when the change came
 [-]. No alarm depends on it."""
@@ -374,6 +398,18 @@ class Detector:
     """Length of the reference [s]."""
     repeated: float
     """Share of the reference whose motions its other parts cover [-]."""
+    largest: float = 0.0
+    """Largest mean square of the level over the components for `SUDDEN_S`, in the reference [-]."""
+
+    @property
+    def sudden_limit(self) -> float:
+        """Mean square of the level over the components for `SUDDEN_S` that raises the alarm [-]."""
+        return max(self.design.scale**2, SUDDEN_TIMES**2 * self.largest)
+
+    def size(self, squares: np.ndarray) -> np.ndarray:
+        """(...) mean square of the level over the components, of (..., 3 d) squares as
+        `Whitening.squares` gives them."""
+        return sizes(squares / self.enlargement**2)
 
     @property
     def judges(self) -> bool:
@@ -395,6 +431,18 @@ class Detector:
         limit = self.threshold
         steps = increments(squares / self.enlargement**2, counts, self.design, limit)
         return np.minimum(steps, MOST_VALUE * counts * limit)
+
+
+def sizes(squares: np.ndarray) -> np.ndarray:
+    """(...) mean over the levels among squares (..., 3 d) of charts."""
+    return squares[..., : squares.shape[-1] // CHARTS].mean(axis=-1)
+
+
+def lasting(values: np.ndarray, blocks: int) -> np.ndarray:
+    """(J - blocks + 1,) least of each so many consecutive values (J,); empty for fewer."""
+    if len(values) < blocks:
+        return values[:0]
+    return np.lib.stride_tricks.sliding_window_view(values, blocks).min(axis=1)
 
 
 def threshold(design: AlarmDesign, components: int) -> float:
@@ -481,6 +529,8 @@ def fit_detector(
     ridge = min(RIDGES, key=lambda each: sum((part.left**2).sum() for part in held[each]))
     found, squares, counts = _whitened(held[ridge], design, elsewhere_mm2)
     enlargement = _enlargement(squares, counts, design)
+    long = round(SUDDEN_S / design.block_s)
+    lasted = [lasting(sizes(part / enlargement**2), long) for part in squares]
     distance = np.concatenate([stretch.residual_mm for stretch in reference])
     covered = np.concatenate([part.covered for part in held[ridge]])
     return Detector(
@@ -493,6 +543,7 @@ def fit_detector(
         float(np.sqrt(np.nanmean((distance**2).sum(-1)))),
         count * design.block_s,
         float(covered.mean()),
+        float(np.concatenate(lasted).max(initial=0.0)) if lasted else 0.0,
     )
 
 
@@ -629,8 +680,8 @@ class Alarm:
     """Estimated time of the change: the median of the times until which the charts that have risen
     to half the threshold were at zero [s]."""
     chart: str
-    """`level`, of an error that lasts, `innovation`, of one that came fast, or `fast moves`, of one
-    that comes with each of them."""
+    """`level`, of an error that lasts, `innovation`, of one that came fast, `fast moves`, of one
+    that comes with each of them, or `sudden`, of one that is large at once."""
     before_mm: float
     """RMS distance of the key points from the model in the reference [mm]."""
     after_mm: float
@@ -653,7 +704,7 @@ class Charts:
     detector: Detector
     """The detector."""
     statistic: float = 0.0
-    """Largest chart over the threshold: 1 raises the alarm [-]."""
+    """Largest chart over its threshold: 1 raises the alarm [-]."""
     alarm: Alarm | None = None
     """The alarm that is standing, None where the model holds."""
     alarms: list[Alarm] = field(default_factory=list)
@@ -661,9 +712,11 @@ class Charts:
     judged: int = 0
     """Blocks that the charts have taken."""
     left_out: int = 0
-    """Blocks whose motion is not in the reference."""
+    """Blocks whose motion, or most of the motion before them, is not in the reference."""
     _charts: np.ndarray | None = None
     _recent_charts: deque[np.ndarray] = field(default_factory=deque)
+    _covered: deque[bool] = field(default_factory=deque)
+    _sizes: deque[tuple[float, float]] = field(default_factory=deque)
     _zero_s: np.ndarray | None = None
     _mean: np.ndarray | None = None
     _before: np.ndarray | None = None
@@ -675,7 +728,10 @@ class Charts:
     _recent: list[tuple[float, float]] = field(default_factory=list)
 
     def __post_init__(self):
-        self._recent_charts = deque(maxlen=round(MOVE_S / self.detector.design.block_s))
+        block_s = self.detector.design.block_s
+        self._recent_charts = deque(maxlen=round(MOVE_S / block_s))
+        self._covered = deque(maxlen=round(RECENT_S / block_s))
+        self._sizes = deque(maxlen=round(SUDDEN_S / block_s))
 
     def update(self, t_s: float, residual_mm: np.ndarray, actuation: np.ndarray) -> Alarm | None:
         """Take the residual (n, 3) [mm] and the actuation (m,) of a time [s].
@@ -697,6 +753,7 @@ class Charts:
     def pause(self) -> None:
         """The samples that follow do not continue those before: a reset, or a gap in time."""
         self._rows, self._actuations = [], []
+        self._sizes.clear()
         self._before = self._position = self._direction = self._begin_s = None
 
     def _close(self, t_s: float) -> Alarm | None:
@@ -725,8 +782,11 @@ class Charts:
         if before is None or last_position is None:
             return None
         moved = np.concatenate([position, change])
-        if not (detector.judges and detector.coverage.covers(moved)):
+        covered = bool(detector.coverage.covers(moved))
+        self._covered.append(covered)
+        if not (detector.judges and covered and np.mean(self._covered) >= LEAST_RECENT):
             self.left_out += 1
+            self._sizes.clear()
             return None
         self.judged += 1
         squares, counts = detector.whitening.squares(
@@ -742,7 +802,8 @@ class Charts:
         self._charts = np.minimum(self._charts, np.min(self._recent_charts, axis=0) + MOST_MOVE * h)
         self._recent_charts.append(self._charts)
         self._zero_s[self._charts == 0.0] = t_s
-        self.statistic = float(self._charts.max() / h)
+        self._sizes.append((float(detector.size(squares)), float(sizes(counts))))
+        self.statistic = max(float(self._charts.max() / h), self._sudden())
         if self.alarm is None and self.statistic > 1.0:
             return self._raise(t_s)
         if self.alarm is not None and self.statistic < OVER:
@@ -751,17 +812,31 @@ class Charts:
             self._recent = self._recent[-round(120.0 / detector.design.block_s) :]
         return None
 
+    def _sudden(self) -> float:
+        """Least size of the last blocks over its limit, 0 while they are too few or the arm hardly
+        moved."""
+        if len(self._sizes) < (self._sizes.maxlen or 0):
+            return 0.0
+        if sum(worth for _, worth in self._sizes) < SUDDEN_WORTH:
+            return 0.0
+        least = min(size for size, _ in self._sizes)
+        return min(least / self.detector.sudden_limit, HIGHEST)
+
     def _raise(self, t_s: float) -> Alarm:
         assert self._charts is not None
         assert self._zero_s is not None
         kinds = ("level", "innovation", "fast moves")
         chart = int(self._charts.argmax())
+        h = self.detector.threshold
+        sudden = self._charts.max() <= h
         # One chart may have risen before the change; the most that have risen did so with it.
-        risen = self._charts > RISEN * self.detector.threshold
+        risen = self._charts >= min(RISEN * h, self._charts.max())
         since_s = float(np.quantile(self._zero_s[risen], 0.5, method="lower"))
+        if sudden:
+            since_s = min(since_s, t_s - SUDDEN_S)
         squares = [square for at_s, square in self._recent if at_s > since_s]
         after = float(np.sqrt(np.mean(squares))) if squares else float("nan")
-        name = kinds[chart * CHARTS // len(self._charts)]
+        name = "sudden" if sudden else kinds[chart * CHARTS // len(self._charts)]
         self.alarm = Alarm(t_s, since_s, name, self.detector.reference_mm, after)
         self.alarms.append(self.alarm)
         return self.alarm

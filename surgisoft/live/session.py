@@ -23,6 +23,7 @@ from surgisoft.agents.on_rig import RigConfig, on_rig
 from surgisoft.agents.policies import POLICIES, Policy, check_policy, open_policy
 from surgisoft.agents.run_folder import RunFolder, run_path
 from surgisoft.agents.session import task_config
+from surgisoft.diagnosis.inputs import shares_in_fit
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.files import json_safe
 from surgisoft.live.change import (
@@ -709,6 +710,13 @@ class _Session:
 
     def _detector(self, before: list[Recording]) -> Detector:
         """The detector from recordings of the unchanged arm."""
+        for recording, share in zip(before, shares_in_fit(self.model, before), strict=True):
+            if share:
+                self.on_warning(
+                    f"{recording.name}: the model was fitted to {100 * share:.0f} % of its rows, "
+                    "and its error is smaller there than in the run: false alarms may come more "
+                    "often than stated; give a recording that took no part in the fit by --before"
+                )
         runs = [run for recording in before for run in residual_runs(self.model, recording)]
         span = np.array(self.model.spec.span)
         detector = fit_detector(runs, span, self.request.alarm, elsewhere(self.model))

@@ -5,11 +5,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from surgisoft.errors import InputError
 from surgisoft.measurement.histories import arm_spec, check_fits, history_of
 from surgisoft.measurement.recordings import Recording, check_same_arm, load_recordings
 from surgisoft.surrogate.effects import named_effect
 from surgisoft.surrogate.fit import AUTO, FitConfig, FitResult
 from surgisoft.surrogate.fit import fit as fit_histories
+from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.workers import torch_threads
 
 Recordings = Iterable[Recording | str | Path] | Recording | str | Path
@@ -53,6 +55,7 @@ def fit(
     spec = arm_spec(train, actuation)
     if held:
         check_fits(spec, held)
+        _refuse_training_rows(train, held, actuation)
     with torch_threads(threads):
         return fit_histories(
             history_of(train, actuation),
@@ -61,3 +64,16 @@ def fit(
             config,
             progress,
         )
+
+
+def _refuse_training_rows(train: list[Recording], held: list[Recording], actuation: str) -> None:
+    """Raise InputError where held-out recordings have rows of the training recordings."""
+    known = FittedRows.of([history_of(train, actuation)])
+    for recording in held:
+        share = known.part_of(history_of([recording], actuation))
+        if share:
+            raise InputError(
+                f"{recording.label}: {100 * share:.0f} % of its rows are in the training "
+                "recordings, expected held-out recordings that take no part in the training; give "
+                "another one, or none: then a part of the training recordings is held out"
+            )

@@ -100,7 +100,7 @@ RIGS: dict[str, Callable[..., Rig]] = {
 }
 """The rigs of this package by name."""
 SIMULATED = ("virtual", "elastica")
-"""Those of them that are simulated, with hidden effects."""
+"""Names of the simulated rigs, which have hidden effects."""
 
 
 def hidden_of(name: str) -> dict[str, Any]:

@@ -122,7 +122,7 @@ class Mesh:
         return digest.hexdigest()
 
     def transformed(self, pose: np.ndarray) -> Mesh:
-        """The same mesh moved by a pose (4, 4): vertices in the pose's parent frame."""
+        """This mesh moved by a pose (4, 4): vertices in the pose's parent frame."""
         return Mesh(frames.apply(pose, self.vertices_mm), self.faces)
 
 

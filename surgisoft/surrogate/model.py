@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, counted
 from surgisoft.surrogate.arm import ArmSpec, ArmState
 from surgisoft.surrogate.backbone import Backbone
 from surgisoft.surrogate.callables.network import CallableNetwork
@@ -323,8 +323,8 @@ class ArmModel(nn.Module):
         if isinstance(self.network, PredictedNetwork):
             kind = f"predictions of {self.network.name}"
         return (
-            f"{kind} ({inputs}), {self.spec.chambers} chambers in "
-            f"{self.spec.unit} ({self.spec.actuation}), {self.spec.key_points} key points, "
+            f"{kind} ({inputs}), {counted(self.spec.chambers, 'chamber')} in {self.spec.unit} "
+            f"({self.spec.actuation}), {counted(self.spec.key_points, 'key point')}, "
             f"effects: {effects}"
         )
 

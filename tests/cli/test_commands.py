@@ -382,3 +382,12 @@ def test_an_interrupted_experiment_says_how_to_go_on(tmp_path, monkeypatch, caps
     assert run(["experiment", "run", "liver"]) == 130
     said = capsys.readouterr().out
     assert f"continue with: surgisoft experiment run liver -o {tmp_path} --resume" in said
+
+
+def test_a_command_leaves_the_function_of_commands_in_place(capsys):
+    """No module of a command has the name of a function of `surgisoft.cli`."""
+    import surgisoft.cli
+
+    assert surgisoft.cli.run(["recording", "nowhere.parquet"]) == 2
+    assert surgisoft.cli.run(["recording", "nowhere.parquet"]) == 2
+    assert capsys.readouterr().err.count("nowhere.parquet") >= 2

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from surgisoft.cli import run
-from surgisoft.credibility.assessment import PointError, criteria_of
+from surgisoft.credibility.assessment import Assessment, Comparator, PointError, criteria_of
 from surgisoft.credibility.context import Risk, load_context
 from surgisoft.credibility.of_experiment import assess_experiment
 from surgisoft.errors import InputError
@@ -109,6 +109,30 @@ def test_a_micrometre_on_a_limit_flips_the_result(tmp_path):
         assert found.passed is passed
     (_, share) = criteria_of(context, points, None)
     assert not share.passed  # no scenario was compared
+
+
+def test_no_validation_is_claimed_on_recordings_of_the_fit(tmp_path):
+    """Limits that the error is far below are not met where the model was fitted to comparators."""
+    (tmp_path / "a.parquet").touch()
+    (tmp_path / "context.toml").write_text(CONTEXT)
+    context = load_context(tmp_path / "context.toml")
+    limits = dataclasses.replace(
+        context.limits, error_mm=9.0, tip_error_mm=9.0, area_mm=9.0, applicable=None
+    )
+    context = dataclasses.replace(context, limits=limits)
+    points = (PointError("k0", 0.2, None, 0.1, 0.05), PointError("body", 0.4, None, 0.2, 0.1))
+    assert [each.passed for each in criteria_of(context, points, None)] == [True] * 3
+    criteria = criteria_of(context, points, None, fitted=True)
+    assert [each.passed for each in criteria] == [False] * 3
+    assert "on data that took no part in the fit" in criteria[0].name
+    about = dict.fromkeys(field.name for field in dataclasses.fields(Assessment))
+    seen = Comparator("a", "", "", "", "", "continuous", 9, 1.0, (), 0.4)
+    about |= {"points": points, "criteria": criteria, "comparators": (seen,)}
+    found = Assessment(**about)
+    assert found.sentence.startswith("no validation: the model was fitted to 40 % of a;")
+    assert "the model's error lies between" not in found.sentence
+    new = dataclasses.replace(found, comparators=(dataclasses.replace(seen, in_fit=0.0),))
+    assert "the model's error lies between" in new.sentence
 
 
 def test_an_experiment_gets_the_report_of_its_scenario(bench, tmp_path):

@@ -255,7 +255,7 @@ def test_the_fall_is_that_of_the_rms_distance():
         block=block,
         floor_mm=0.1,
         index=np.arange(60),
-        model=SimpleNamespace(fitted_rows=None),
+        in_fit=None,
     )
     after = SimpleNamespace(residual=residual * (2 / 3), block=block)
     found = fall_of(before, after)

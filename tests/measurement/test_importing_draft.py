@@ -64,7 +64,30 @@ def test_what_a_header_does_not_say_is_marked(tmp_path):
     assert 'columns = ["pressure1"]\nunit = "kPa"  # check: the header names no unit' in text
     assert 'positions = [["x0", "y0", "z0"]]\nunit = "mm"  # check' in text
     assert '[runs]  # check: a new value begins a new run\ncolumn = "take"' in text
-    assert "# not used: set1, target_x, target_y, target_z" in text
+    assert '[measured]\ncolumns = ["pressure1"]' in text
+    assert '[commanded]\ncolumns = ["set1"]' in text
+    assert "# not used: target_x, target_y, target_z" in text
+
+
+@pytest.mark.parametrize(
+    ("names", "table"),
+    [
+        ("north_set_bar,west_set_bar", "[commanded]"),
+        ("target_p1_kPa,target_p2_kPa", "[commanded]"),
+        ("Soll 1,Soll 2", "[commanded]"),
+        ("north_bar,west_bar", "[measured]  # check: measured by sensors?"),
+    ],
+)
+def test_set_values_are_no_measurements(tmp_path, names, table):
+    path = lab_file(tmp_path, f"t_ms,{names},x_m,y_m,z_m,x_soll_m,y_soll_m,z_soll_m")
+    text = draft_map(path)
+    first, second = names.split(",")
+    assert f"{table}" in text
+    assert f'columns = ["{first}", "{second}"]' in text
+    assert "# not used: x_soll_m, y_soll_m, z_soll_m" in text
+    found = imported(path, tmp_path)
+    assert (found.commanded is not None) == (table == "[commanded]")
+    np.testing.assert_allclose(found.measured, [row[1:3] for row in ROWS])
 
 
 def test_no_key_points_and_no_numbers_are_errors(tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from surgisoft.diagnosis.amend import amend
-from surgisoft.diagnosis.compare import compare
+from surgisoft.diagnosis.inputs import open_inputs
 from surgisoft.measurement.fitting import fit
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import make_protocol
@@ -54,21 +54,29 @@ def test_a_sketch_is_small_and_joins_as_the_rows_do(pair):
     assert FittedRows.from_json(both.to_json()) == both
 
 
-def test_a_model_keeps_what_it_was_fitted_to_and_compare_reports_it(pair, model, tmp_path):
+def test_a_model_keeps_what_it_was_fitted_to_and_notes_report_it(pair, model, tmp_path):
     save_model(model, tmp_path / "arm")
     opened = load_model(tmp_path / "arm")
     assert opened.fitted_rows == model.fitted_rows
-    assert "the model was fitted to 100 %" in " ".join(compare(opened, [pair[0]])[0].notes)
-    assert "fitted to" not in " ".join(compare(opened, [pair[1]])[0].notes)
+    assert "the model was fitted to 100 %" in " ".join(open_inputs(opened, [pair[0]])[2])
+    assert "fitted to" not in " ".join(open_inputs(opened, [pair[1]])[2])
 
 
 def test_amend_states_where_held_out_rows_were_in_the_fit(pair, model):
     """The rows that `amend` itself holds out are none of those of the amended model."""
     found = amend(model, [pair[0]], "gain_mismatch", False, refit="never")
     assert found.held_out.in_fit == 1.0
-    assert "100% of which the model had been fitted to" in found.held_out.sentence
+    assert "of which the model had been fitted to 100%" in found.held_out.sentence
     fresh = amend(model, [pair[1]], "gain_mismatch", False, refit="never")
     assert fresh.held_out.in_fit == 0.0
     again = amend(fresh.model, [pair[1]], "gain_mismatch", False, refit="never")
     assert again.held_out.in_fit == 0.0
     assert again.training.in_fit > 0.9
+
+
+def test_the_default_arm_knows_its_rows(pair):
+    """13,824 rows of the grid and 1,000 of the validation of `SOURCE.md`, none of other motion."""
+    known = load_model("default").fitted_rows
+    assert known.complete
+    assert (known.count, len(known.hashes)) == (14_824, SIZE)
+    assert known.share_of(history_of([pair[0]])) == 0.0

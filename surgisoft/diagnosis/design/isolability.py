@@ -330,7 +330,7 @@ def _slopes(
 
 
 def under(effect: Effect, facts: ArmFacts) -> Effect:
-    """The same effect with the same parameters on an arm that stands otherwise."""
+    """An effect with equal parameters on an arm in another experimental setup."""
     answer = type(effect)(facts, **effect.config())
     answer.load_state_dict(effect.state_dict())
     return answer

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from surgisoft.diagnosis.amend import Amendment, Track
+from surgisoft.diagnosis.amend import Amendment, Fall, Track
 from surgisoft.diagnosis.diagnose import Diagnosis
 from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
 from surgisoft.diagnosis.improve import NETWORK, Improvement, Round
 from surgisoft.diagnosis.pages.pictures import bodies, save
 from surgisoft.diagnosis.residuals import ResidualTable
+from surgisoft.errors import counted
 from surgisoft.files import new_file
 from surgisoft.report import (
     Command,
@@ -36,7 +37,16 @@ HOW = (
     "with the model discrepancy beside them. The errors on top are those on the held-out part "
     "(the last quarter of each recording, of four runs or more the last ones), evaluated once.\n\n"
     "Intervals are 95 %, from a bootstrap of blocks of time, because consecutive rows have "
-    "correlated errors."
+    "correlated errors.\n\n"
+    "A parameter outside its plausible range, or with an interval over decades, is one that these "
+    "recordings do not determine: the prediction was validated, not the number."
+)
+HOW_IN_FIT = (
+    "The given model had been fitted to {:.0%} of the held-out rows. They took no part in the fit "
+    "of the effects, but they are no data that took no part: the given model's error there is "
+    "smaller than on new recordings, and intervals of parameters do not know what its network has "
+    "taken of the effects. `surgisoft compare MODEL NEW REC --test` compares both models on "
+    "recordings that neither was fitted to."
 )
 POINTS = 600
 """Points of a line in a chart."""
@@ -53,6 +63,7 @@ def amend_page(result: Amendment, title: str, about: str) -> Page:
             ("noise floor", f"{fall.floor:.3f} mm"),
             ("fall, 95 %", f"{fall.ci95[0]:.3f} .. {fall.ci95[1]:.3f} mm"),
             ("held-out rows", f"{fall.rows}"),
+            *_in_fit(fall),
         ]
     )
     training, held_out = result.tracks
@@ -68,15 +79,35 @@ def amend_page(result: Amendment, title: str, about: str) -> Page:
                 "Error over time",
                 track_charts(
                     {
-                        "Held-out part: not used in the fit": held_out,
+                        f"Held-out part: {_use(fall)}": held_out,
                         "Training part: the parameters were fitted to it": training,
                     },
                     result.held_out.floor,
                 ),
             ),
-            Section("How to read this", [Text(HOW)]),
+            Section("How to read this", how_to_read(fall)),
         ],
     )
+
+
+def how_to_read(fall: Fall) -> list[Part]:
+    """How to read the page, and what it does not claim where the model knew the held-out rows."""
+    parts: list[Part] = [Text(HOW)]
+    if fall.in_fit:
+        parts.append(Text(HOW_IN_FIT.format(fall.in_fit)))
+    return parts
+
+
+def _in_fit(fall: Fall) -> list[tuple[str, str]]:
+    """The share of the held-out rows in the given model's fit, where there is one."""
+    return [("of them in the model's fit", f"{fall.in_fit:.0%}")] if fall.in_fit else []
+
+
+def _use(fall: Fall) -> str:
+    """What the held-out rows were used for, in words."""
+    if fall.in_fit:
+        return f"not used for the effects, {fall.in_fit:.0%} of it in the model's own fit"
+    return "not used in the fit"
 
 
 def parameter_table(parameters: tuple[Parameter, ...]) -> Table:
@@ -159,6 +190,7 @@ def improve_page(
             ("noise floor", f"{fall.floor:.3f} mm"),
             ("fall, 95 %", f"{fall.ci95[0]:.3f} .. {fall.ci95[1]:.3f} mm"),
             ("steps", f"{len(result.steps)}"),
+            *_in_fit(fall),
         ]
     )
     training, held_out = result.tracks
@@ -170,7 +202,9 @@ def improve_page(
         alt = "The body before and after, measured and predicted, with one scale of the errors"
         failed.append(Picture.from_file(drawn, alt, f"{alt}; held-out part", 620, drawn=True))
     captions = {
-        "Error on the held-out part: not used in any round": held_out,
+        f"Error on the held-out part: {_use(fall) if fall.in_fit else 'not used in any round'}": (
+            held_out
+        ),
         "Error on the training part: diagnosed and fitted on it": training,
     }
     failed += track_charts(captions, fall.floor)
@@ -187,7 +221,7 @@ def improve_page(
         parts.append(Section("Parameters", [parameter_table(result.parameters)]))
     if result.diagnoses:
         parts.append(_left(result))
-    parts.append(Section("How to read this", [Text(HOW)]))
+    parts.append(Section("How to read this", how_to_read(fall)))
     tone = "good" if result.claimed else "warn"
     return Page(title=title, verdict=result.sentence, about=about, tone=tone, parts=parts)
 
@@ -235,13 +269,13 @@ def _measured(table: ResidualTable) -> Section:
             )
         )
     header = ["recording", "rows", "duration", "runs", "actuation", "held out"]
-    text = (
-        f"{spec.chambers} chambers and {spec.key_points} key points of one arm were recorded. The "
-        f"noise of a key point is {table.floor.rmse_mm:.3f} mm ({table.floor.source}); no model "
-        "can have a smaller error."
-        if table.floor.rmse_mm is not None
-        else f"{spec.chambers} chambers and {spec.key_points} key points of one arm were recorded."
-    )
+    points = counted(spec.key_points, "key point")
+    text = f"{counted(spec.chambers, 'chamber')} and {points} of one arm were recorded."
+    if table.floor.rmse_mm is not None:
+        text += (
+            f" The noise of a key point is {table.floor.rmse_mm:.3f} mm ({table.floor.source}); no "
+            "model can have a smaller error."
+        )
     return Section("What was measured", [Text(text), Table(header, rows)])
 
 

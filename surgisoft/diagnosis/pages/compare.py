@@ -122,6 +122,8 @@ def _facts(result: Comparison) -> Facts:
     if result.coverage is not None:
         items.append(("within the 95 % prediction interval", f"{100 * result.coverage:.1f} %"))
     items.append(("rows", f"{result.samples}"))
+    if result.in_fit:
+        items.append(("of them in the model's fit", f"{result.in_fit:.0%}"))
     if result.missing:
         items.append(("rows without key points", f"{result.missing}"))
     return Facts(items)

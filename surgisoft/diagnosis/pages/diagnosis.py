@@ -28,6 +28,11 @@ HOW = (
     "The diagnosis did not see the last quarter of each recording: `surgisoft amend` validates its "
     "model on it."
 )
+HOW_IN_FIT = (
+    "The model was fitted to {:.0%} of the rows that were looked at. So blocks of time are left "
+    "out of the fit of the effects alone, and no error on this page is one on data that took no "
+    "part in the model's fit."
+)
 HOW_SETUP = (
     "Frames, units, orders, chambers, clocks and dead channels are tested before any effect. A "
     "fault is named where the model, with the fault corrected, predicts held-out blocks of time "
@@ -62,6 +67,8 @@ def diagnosis_page(found: Diagnosis, title: str) -> Page:
         ("best achievable error", f"{error.ceiling:.3f} mm"),
         ("time", f"{found.seconds:.1f} s"),
     ]
+    if found.in_fit:
+        facts.append(("rows in the model's fit", f"{found.in_fit:.0%}"))
     parts: list[Part] = [Facts(facts)]
     if found.checks:
         parts.append(
@@ -100,7 +107,10 @@ def diagnosis_page(found: Diagnosis, title: str) -> Page:
         )
     if verdict.effects:
         parts.append(_parameters(found))
-    parts.append(Section("How to read this", [Text(HOW_SETUP if found.setup else HOW)]))
+    how = [Text(HOW_SETUP if found.setup else HOW)]
+    if found.in_fit:
+        how.append(Text(HOW_IN_FIT.format(found.in_fit)))
+    parts.append(Section("How to read this", how))
     unsure = bool(verdict.effects) and verdict.confidence < LEAST_SURE
     return Page(
         title=f"Diagnosis of {title}",
@@ -230,7 +240,8 @@ def _ranking(found: Diagnosis) -> Table:
         )
         for row in found.shown
     ]
-    header = ["effect", "confidence", "alone", "unique", "held-out [mm]", "95 %", "p-value"]
+    left = "left-out [mm]" if found.in_fit else "held-out [mm]"
+    header = ["effect", "confidence", "alone", "unique", left, "95 %", "p-value"]
     return Table(header, rows)
 
 

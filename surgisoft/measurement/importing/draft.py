@@ -26,7 +26,11 @@ NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?|nan|n/a|", re.
 """A cell of a row of numbers: a number, or one that is missing. The patterns below are of column
 names in English and German, and what they find is marked for checking."""
 TIME = re.compile(r"t|time.*|zeit.*|(time)?stamps?|elapsed.*|clock|sec(onds)?", re.I)
-COMMAND = re.compile(r"cmd|command|soll|set ?point|desired|reference|(^|_)[cu]_?\d", re.I)
+COMMAND = re.compile(
+    r"cmd|command|soll|set[ _]?point|desired|reference|target|goal"
+    r"|(^|_)[cu]_?\d|[ _]set($|[ _])|(^|_)set[ _]?\w",
+    re.I,
+)
 ACTUATION = re.compile(
     r"press|druck|pneu|valve|ventil|motor|servo|tendon|cable|chamber|kammer|bellow|actuat|(^|_)p_?\w$",
     re.I,
@@ -36,6 +40,8 @@ NOT_MEASURED = re.compile(r"target|goal|soll|reference|desired|predict|\bvel|\ba
 RUN = re.compile(r"(run|take|trial|episode|repeat)([_ ]?(id|nr|no|number|index))?", re.I)
 AN_X = re.compile(r"(?<![A-Za-z])[xX](?![A-Za-z])|(?<=[a-z0-9])X(?![a-z])")
 """An x that stands for the axis: `x0`, `tip_x`, `tipX`."""
+AN_AXIS = re.compile(r"(^|[_ .])[xyz]($|[_ .\d])", re.I)
+"""An axis in the name of a position."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +78,7 @@ def draft_map(path: str | Path) -> str:
     time = next((n for n in names if TIME.fullmatch(_split(n, SECONDS_PER)[0].strip())), None)
     used |= {time} if time else set()
     rest = [name for name in names if name and name not in used]
-    commanded = [n for n in rest if COMMAND.search(n) and not NOT_MEASURED.search(n)]
-    commanded += [n for n in rest if re.search("soll", n, re.I) and n not in commanded]
+    commanded = [name for name in rest if _is_command(name)]
     measured = [n for n in rest if n not in commanded and _is_actuation(n)]
     lines = [
         f"# Draft of a map for {path.name}, from the names of its columns. Check every line:",
@@ -89,10 +94,14 @@ def draft_map(path: str | Path) -> str:
     else:
         unit = _unit([time], SECONDS_PER, "s")
         lines += [f"column = {column([time])[0]}", f"unit = {unit}", ""]
-    for table, found in (("measured", measured), ("commanded", commanded)):
+    doubt = "" if commanded else "  # check: measured by sensors? Set values are [commanded]"
+    if commanded and not measured:
+        measured = commanded
+        doubt = "  # check: set values stand in, no sensor is here; fit with --actuation commanded"
+    for table, found in ((f"[measured]{doubt}", measured), ("[commanded]", commanded)):
         if found:
             unit = _unit(found, ACTUATION_UNITS, "kPa")
-            lines += [f"[{table}]", f"columns = [{', '.join(column(found))}]", f"unit = {unit}"]
+            lines += [table, f"columns = [{', '.join(column(found))}]", f"unit = {unit}"]
             lines += ['# to = "kPa"  # the unit of your model, if it is another one', ""]
     if not measured and not commanded:
         lines += ["# [measured]  # check: no columns of the actuation are recognised", ""]
@@ -204,6 +213,14 @@ def _key_points(names: Sequence[str]) -> list[tuple[str, str, str]]:
                 found.append((name, put[0], put[1]))
                 break
     return found
+
+
+def _is_command(name: str) -> bool:
+    """Whether a column is an actuation that was asked for, and no position that was."""
+    stem = _split(name, ACTUATION_UNITS)[0]
+    wanted = NOT_MEASURED.search(name) and not re.search("soll", name, re.I)
+    position = wanted or AN_AXIS.search(stem) or _split(name, MM_PER)[1]
+    return COMMAND.search(stem) is not None and (_is_actuation(name) or not position)
 
 
 def _is_actuation(name: str) -> bool:

@@ -337,7 +337,7 @@ def robust(
         ),
     ] = "ring,scripted",
     robots: Annotated[
-        str, typer.Option(help="Seeds of the robots, with commas; 0 to 18 served for development.")
+        str, typer.Option(help="Seeds of the robots, with commas; 0 to 20 served for development.")
     ] = "21,22,23,24,25,26,27,28,29,30",
     own: Annotated[
         str, typer.Option(help="Those that a model is fitted to, too, with commas; may be empty.")

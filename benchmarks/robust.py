@@ -39,7 +39,7 @@ from surgisoft.tasks.world.arm import Randomisation
 
 TASK = "circle_ablation"
 """The task that is judged."""
-DEVELOPMENT = range(19)
+DEVELOPMENT = range(21)
 """Seeds of robots on which the observer's constants were chosen, or that earlier results show."""
 MINUTES_POINTS = 12_000
 """Samples of a robot's own recording: ten minutes of `mixed` at 20 Hz."""

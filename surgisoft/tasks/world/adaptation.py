@@ -80,10 +80,10 @@ PROBE = 0.01
 class AdaptationPrior:
     """How large disturbances are expected to be, as standard deviations.
 
-    The values were chosen on robots 0 to 20 of the virtual rig, on robots 11 to 20 with hidden lags,
-    friction, breath and a valve that sticks, too. With less than 0.3 kPa the error without a hidden
-    effect falls by a further 2 %, but the estimate lags by more behind a valve that comes free.
-    `benchmarks/robust.py` judges on other robots.
+    The values were chosen on robots 0 to 20 of the virtual rig, on robots 11 to 20 with hidden
+    lags, friction, breath and a valve that sticks, too. With less than 0.3 kPa the error without a
+    hidden effect falls by a further 2 %, but the estimate lags by more behind a valve that comes
+    free. `benchmarks/robust.py` judges on other robots.
     """
 
     noise_mm: float = 0.08

@@ -261,7 +261,7 @@ class ModelArm:
         if spec.unit != "kPa":
             raise InputError(
                 f"arm '{name}': its model has the unit {spec.unit}, expected kPa; convert the "
-                "recordings by the map of 'surgisoft import' (to = \"kPa\" for pressures, scale for "
+                "recordings by the map of 'surgisoft import' (to = 'kPa' for pressures, scale for "
                 "other quantities) and fit again"
             )
         start = spec.rest if mounted.start_kPa is None else mounted.start_kPa

@@ -87,6 +87,7 @@ def modelling(
         typer.Option(min=64, help="Number of training points; default 13,824, as in the paper."),
     ] = None,
     processes: Processes = 2,
+    work: Work = Path("runs/benchmark-modelling"),
     images: Images = None,
     output: Output = None,
 ) -> None:
@@ -95,7 +96,7 @@ def modelling(
 
     numbers = _numbers("--seeds", seeds)
     with progress("modelling") as report:
-        table = run(numbers, points, processes, report, images)
+        table = run(numbers, points, processes, report, work, images)
     command = f"surgisoft benchmark modelling --seeds {seeds}"
     if points:
         command += f" --points {points}"

@@ -211,7 +211,7 @@ class Refit:
             return f"{text}; {others} would do about as well"
         return (
             f"{text}; {others} would do about as well, but the model's input is a command, which "
-            "has to pass the line: measure the actuation to tell them"
+            "has to pass the line: measure the actuation to tell them apart"
         )
 
     def of(self, effect: str) -> RefitCandidate:

@@ -242,11 +242,30 @@ class CrossValidation:
 
     def amplitudes(self, chosen: list[int] | tuple[int, ...] | np.ndarray) -> np.ndarray:
         """(k,) amplitudes of the chosen sensitivities, mean over the folds."""
+        return self._fitted(np.asarray(chosen, int))[0]
+
+    def contributions(self, groups: Sequence[tuple[int, ...]]) -> np.ndarray:
+        """(B, 1 + G, 1 + G) held-out products of the residual and of what G effects explain, mm^2.
+
+        groups: the sensitivities of each effect, all fitted together; what an effect explains is
+        their sum at the fitted amplitudes. The model discrepancy is taken out of all of them.
+        """
+        columns = np.array([0, *(1 + one for group in groups for one in group)])
+        amplitudes, level = self._fitted(columns[1:] - 1)
+        mix = np.zeros((len(columns), 1 + len(groups)))
+        mix[0, 0] = 1.0
+        owner = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+        mix[np.arange(1, len(columns)), 1 + owner] = amplitudes
+        products = np.moveaxis(self.held_out[level][columns[:, None], columns], -1, 0)
+        return mix.T @ products.astype(float) @ mix
+
+    def _fitted(self, chosen: np.ndarray) -> tuple[np.ndarray, int]:
+        """(k,) amplitudes of the chosen sensitivities, mean over the folds, and their level."""
         sensitivities, where = np.unique(np.asarray(chosen, int), return_inverse=True)
         tried, amplitudes = self._solved(sensitivities)
         sums = tried.sum(axis=2)
         level, ridge = np.unravel_index(sums.argmin(), sums.shape)
-        return amplitudes[level, ridge].mean(axis=0)[where]
+        return amplitudes[level, ridge].mean(axis=0)[where], int(level)
 
     def _solved(self, sensitivities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """((L, r, B) held-out sums of squares, (L, r, folds, k) amplitudes) for every ridge."""

@@ -15,6 +15,7 @@ the diagnosis ends there. Else it is a system identification of a grey-box model
 6. Experiment design, where effects cannot be told apart (`design`).
 """
 
+import math
 import time
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -74,6 +75,9 @@ WORTH_TELLING = 0.2
 AS_GOOD = 1.64
 """Studentised log gain of two effects over another pair below which the other does as well (5 %,
 one-sided)."""
+VARIES = 0.04
+"""Variance of an amplitude between motions, in units of its square, from which a check mentions it:
+a fifth of the amplitude. Stated."""
 FITTED_STAGES = ("line", "material")
 """Stages of effects that a network can be fitted together with."""
 MOST_FITTED = 3
@@ -472,7 +476,11 @@ def result_of(found: Findings, decision: Decision | None = None) -> Diagnosis:
         ranking=ranking,
         ambiguous_with=effects[1:] if kind == "ambiguous" else others,
         next_experiment=plan,
-        checks=(*data_quality_warnings(problem), *would_explain(found, decision)),
+        checks=(
+            *data_quality_warnings(problem),
+            *would_explain(found, decision),
+            *amplitudes_that_vary(evidence, decision),
+        ),
         statistics=evidence,
         probabilities=decision.probabilities,
         statements=decision.statements,
@@ -499,6 +507,25 @@ def would_explain(found: Findings, decision: Decision) -> list[str]:
     if known_effects()[best.effect].stage in ("line", "material"):
         text += f"; fit the network together with it (fit --effects {best.effect}) and compare"
     return [text]
+
+
+def amplitudes_that_vary(evidence: Evidence, decision: Decision) -> list[str]:
+    """Named effects whose amplitude differs between motions, in words.
+
+    An effect that is there has one amplitude, whatever the motion. Two that are named together are
+    looked at beside each other.
+    """
+    own = {each.effect: each.variation for each in evidence.effects}
+    for each in evidence.proposals:
+        if decision.kind == "several" and set(each.effects) == set(decision.effects):
+            own |= dict(zip(each.effects, each.variation, strict=False))
+    found = [(name, own.get(name) or 0.0) for name in decision.effects]
+    return [
+        f"the amplitude of {name} differs between motions by {100 * math.sqrt(value):.0f} %, and "
+        f"what is missing has one amplitude: something else, or a second effect, may be behind it"
+        for name, value in found
+        if value >= VARIES
+    ]
 
 
 def _instead(evidence: Evidence) -> tuple[str, ...]:

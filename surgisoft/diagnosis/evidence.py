@@ -5,6 +5,7 @@
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -13,14 +14,21 @@ from scipy.special import ndtri
 
 from surgisoft.diagnosis.beyond_history import beyond_history, sudden_turn
 from surgisoft.diagnosis.selection import Findings, ModelSelection, Score, Selected
-from surgisoft.diagnosis.statistics import block_sums, studentised
+from surgisoft.diagnosis.statistics import block_sums, studentised, variance_between
 from surgisoft.surrogate.effects import hypothesis_of, known_effects
 
 VERSION = 3
 """Version of the evidence, raised when a number gets another meaning: stored evidence of another
 version is collected again."""
+INDEPENDENT = 6.0
+"""Independent values in the error that is left in one block of time: a body errs in two directions
+of bending, and over the shortest correlation that the cross-validation tries (`PERSISTENCE`, 5
+rows) a block of about 17 rows has three."""
 COLLINEAR_RIDGE = 1e-6
 """Ridge, as a share of the mean power of the sensitivities, of the regression for collinearity."""
+TINY = 1e-9
+"""Share of an effect's power in all motions that counts as none in one of them: its amplitude there
+is as good as unknown, and has next to no weight."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +68,10 @@ class EffectEvidence:
     free_amplitudes: int | None = None
     """Number of amplitudes that its fit chose, those of a refined candidate too; None in stored
     evidence that does not have it."""
+
+    variation: float | None = None
+    """Variance of its amplitude between motions, in units of its square, beyond what the error that
+    it leaves makes of it (`variation`); None in stored evidence that does not have it."""
 
     @property
     def size(self) -> int:
@@ -112,6 +124,9 @@ class ProposalEvidence:
     left_log_free: float = 0.0
     """Mean over blocks of log(error with them / error of the free black box), the noise in both:
     of an effect's own form a learner without physics leaves no less."""
+    variation: tuple[float, ...] = ()
+    """For each of them the variance of its amplitude between motions beside the others, in units of
+    its square (`variation`); empty in stored evidence that does not have it."""
 
 
 @dataclass(frozen=True)
@@ -254,6 +269,35 @@ def _margin(found: Selected, gap: np.ndarray) -> float:
     return float(studentised(by_motion)[0]) if by_motion.any() else 0.0
 
 
+def variation(found: Selected, scores: Sequence[Score]) -> tuple[float, ...]:
+    """Variance between motions of each effect's amplitude, all of them fitted together.
+
+    An effect that is there has one amplitude, whatever the motion; what stands in for another one
+    has another in every motion. In units of the square of the fitted amplitude: 0.04 where
+    amplitudes differ by 20 %. Each motion has amplitudes of its own (least squares on its held-out
+    rows, what the effect explains scaled by one factor). Their variance beyond that of the
+    estimates is that of random effects (`variance_between`); an estimate has that of what is left
+    in the motion, as INDEPENDENT values for each of its blocks. It asks for constant parameters
+    (Chow 1960) over motions in no order, where a relaxed form asks for trends in time and state.
+    """
+    selection, motion = found.selection, found.problem.motion
+    products = selection.validation.contributions([score.option.chosen for score in scores])
+    by_motion = np.zeros((int(motion.max()) + 1, *products.shape[1:]))
+    np.add.at(by_motion, motion, products)
+    own, right = by_motion[:, 1:, 1:], by_motion[:, 1:, 0]
+    most = np.einsum("mee->e", own)
+    spread = np.diag(TINY * np.maximum(most, TINY))
+    inverse = np.linalg.inv(own + spread)
+    factors = np.einsum("mef,mf->me", inverse, right)
+    total = by_motion[:, 0, 0]
+    left = np.maximum(total - np.einsum("me,me->m", factors, right), TINY * total.sum())
+    error = left / (INDEPENDENT * np.bincount(motion))
+    return tuple(
+        variance_between(factors[:, place], error * inverse[:, place, place])
+        for place in range(len(scores))
+    )
+
+
 def _effect(found: Findings, best: Score, score: Score) -> EffectEvidence:
     """One effect alone against the best one."""
     selection, floor = found.selection, float(found.selection.floor.sum())
@@ -278,6 +322,7 @@ def _effect(found: Findings, best: Score, score: Score) -> EffectEvidence:
         form_gain=None if form is None else form.share,
         form_log_gain=None if form is None else form.log_gain,
         form_z=None if form is None else normal_quantile(form.p_value),
+        variation=variation(found, [score])[0],
     )
 
 
@@ -336,4 +381,5 @@ def _proposal(found: Findings, place: int, free: np.ndarray) -> ProposalEvidence
         ),
         instead_margin=tuple(_margin(found, gap) for gap in gaps),
         left_log_free=float(selection.log_ratio(after, free).mean()),
+        variation=variation(found, proposal.scores),
     )

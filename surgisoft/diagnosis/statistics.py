@@ -94,6 +94,22 @@ def studentised(gains: np.ndarray) -> np.ndarray:
     return gains.mean(axis=1) / np.maximum(spread, 1e-12 * np.abs(gains).max(initial=1e-30))
 
 
+def variance_between(estimates: np.ndarray, variances: np.ndarray) -> float:
+    """Variance of a quantity between M samples, beyond that of its estimates (M,) in each of them.
+
+    The moment estimator of random effects (DerSimonian & Laird 1986, "Meta-analysis in clinical
+    trials", eq. 8): by how much the heterogeneity Q of Cochran 1954 exceeds its expected value
+    under one common value, M - 1. 0 where it does not. variances: (M,) of the estimates.
+    """
+    if len(estimates) < 2:
+        return 0.0
+    weights = 1.0 / variances
+    mean = weights @ estimates / weights.sum()
+    excess = weights @ np.square(estimates - mean) - (len(estimates) - 1)
+    unit = weights.sum() - np.square(weights).sum() / weights.sum()
+    return float(max(excess, 0.0) / max(unit, 1e-300))
+
+
 def sign_flip_p_values(
     gains: np.ndarray,
     group: Sequence[str] | np.ndarray | None = None,

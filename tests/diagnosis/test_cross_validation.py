@@ -114,3 +114,18 @@ def test_further_columns_are_as_if_they_had_been_there(data):
     np.testing.assert_allclose(found.held_out, whole.held_out, rtol=1e-4, atol=1e-4)
     assert found.losses([0, 1, 2]) == pytest.approx(whole.losses([2, 1, 0]), rel=1e-4)
     assert found.amplitudes([2, 0]) == pytest.approx(whole.amplitudes([0, 2])[::-1], rel=1e-3)
+
+
+def test_contributions_are_products_of_what_effects_explain(data):
+    """Two groups of columns: their sums at the fitted amplitudes leave the held-out losses."""
+    features, residual, columns, block, fold = data
+    noise, surrogate = np.full(POINTS, 0.05), np.full(POINTS, 0.2)
+    found = cross_validated(features, residual, columns, block, fold, surrogate, noise)
+    products = found.contributions([(1, 2), (0,)])
+    assert products.shape == (BLOCKS, 3, 3)
+    alone = found.contributions([(0, 1, 2)])
+    both = products[:, 1:, 1:].sum((1, 2))
+    assert alone[:, 1, 1] == pytest.approx(both, rel=1e-5)
+    mix = np.array([1.0, -1.0, -1.0])
+    left = np.einsum("i,bij,j->b", mix, products, mix)
+    assert left == pytest.approx(found.losses((0, 1, 2)), rel=0.05)

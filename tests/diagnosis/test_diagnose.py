@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from surgisoft.cli import run
-from surgisoft.diagnosis.diagnose import diagnose, knock, would_explain
+from surgisoft.diagnosis.diagnose import amplitudes_that_vary, diagnose, knock, would_explain
 from surgisoft.diagnosis.residuals import Floor, held_out_rows, residual_table
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import save_recording
@@ -209,6 +209,31 @@ def test_a_knock_is_told_where_a_turn_at_one_moment_explains_more(found):
     assert defined == {"misalignment", "gain_mismatch"}
     told = knock(replace(turned, sudden_margin=3.0))
     assert told.endswith("at one moment, as by a knock, explains more than misalignment")
+
+
+def test_what_is_missing_has_one_amplitude_and_a_check_says_so_where_it_has_not(found):
+    """The robots' own effects vary by less than a fifth; of two named together both are looked at
+    beside each other."""
+    for name in ("creep", "misalignment", "hysteresis"):
+        result = found[name]
+        assert name in result.verdict.effects
+        first = next(each for each in result.statistics.effects if each.effect == name)
+        assert first.variation < 0.04
+        assert not any("amplitude" in check for check in result.checks)
+    evidence = found["creep"].statistics
+    creep = replace(evidence.effects[0], effect="creep", variation=0.25)
+    other = replace(creep, effect="payload", variation=0.0)
+    pair = replace(evidence.proposals[0], effects=("creep", "payload"), variation=(0.01, 0.09))
+    evidence = replace(evidence, effects=(creep, other), proposals=(pair,))
+    for kind, effects, told in (
+        ("identified", ("creep",), "creep differs between motions by 50 %"),
+        ("identified", ("payload",), None),
+        ("several", ("creep", "payload"), "payload differs between motions by 30 %"),
+        ("cannot_tell", (), None),
+    ):
+        checks = amplitudes_that_vary(evidence, SimpleNamespace(kind=kind, effects=effects))
+        assert len(checks) == (told is not None)
+        assert told is None or told in checks[0]
 
 
 def test_steady_state_samples_rank_no_rates(tmp_path, capsys):

@@ -87,6 +87,7 @@ def modelling(
         typer.Option(min=64, help="Number of training points; default 13,824, as in the paper."),
     ] = None,
     processes: Processes = 2,
+    work: Work = Path("runs/benchmark-modelling"),
     images: Images = None,
     output: Output = None,
 ) -> None:
@@ -95,7 +96,7 @@ def modelling(
 
     numbers = _numbers("--seeds", seeds)
     with progress("modelling") as report:
-        table = run(numbers, points, processes, report, images)
+        table = run(numbers, points, processes, report, work, images)
     command = f"surgisoft benchmark modelling --seeds {seeds}"
     if points:
         command += f" --points {points}"
@@ -337,7 +338,7 @@ def robust(
         ),
     ] = "ring,scripted",
     robots: Annotated[
-        str, typer.Option(help="Seeds of the robots, with commas; 0 to 18 served for development.")
+        str, typer.Option(help="Seeds of the robots, with commas; 0 to 20 served for development.")
     ] = "21,22,23,24,25,26,27,28,29,30",
     own: Annotated[
         str, typer.Option(help="Those that a model is fitted to, too, with commas; may be empty.")
@@ -362,6 +363,13 @@ def robust(
             help="Contact by FCL, or by the engine of training, which is faster.",
         ),
     ] = True,
+    poses: Annotated[
+        int,
+        typer.Option(
+            min=1,
+            help="Random pressures, 4 s each, before an episode: the observer learns from them.",
+        ),
+    ] = 3,
     work: Annotated[
         Path, typer.Option(metavar="DIR", help="Folder of models and of each case's result.")
     ] = Path("runs/benchmark-robust"),
@@ -406,6 +414,7 @@ def robust(
         hidden_episodes,
         tuple(hidden.split(",")) if hidden else tuple(HIDDEN),
         exact,
+        poses,
     )
     torch.set_num_threads(1)
     with progress("robust") as report:
@@ -418,6 +427,7 @@ def robust(
     command += f" --hidden {hidden}" if hidden else ""
     command += "" if observers == "filter,learns" else f" --observers {observers}"
     command += "" if exact else " --batched"
+    command += "" if poses == 3 else f" --poses {poses}"
     shown = ""
     if images:
         shown = f"\n![robust](../images/{draw(rows, floors, study, images).name})\n"

@@ -1,12 +1,12 @@
 """Benchmark `modelling`: prediction errors of models as in the paper, on the virtual rig."""
 
 import multiprocessing
-import tempfile
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
+from surgisoft.files import read_json, write_json
 from surgisoft.progress import Progress
 from surgisoft.workers import begin_worker
 
@@ -94,7 +94,7 @@ def collect(seed: int, folder: Path, points: int | None) -> float:
 
 
 def fit_one(task: tuple[int, Case, Path]) -> Outcome:
-    """Fit one model on one robot and evaluate it on the test set; the folder stores the model."""
+    """Fit one model on one robot and evaluate it on the test set; the folder stores both."""
     import torch
 
     from surgisoft.diagnosis.compare import compare
@@ -112,10 +112,10 @@ def fit_one(task: tuple[int, Case, Path]) -> Outcome:
         history_of([train]), history_of([valid]), arm_spec([train]), FitConfig(**case.options)
     )
     comparison, _ = compare(result.model, [test])
-    save_model(result.model, folder / model_name(seed, case))
+    save_model(result.model, folder / model_name(seed, case), force=True)
     network = result.model.network
     kept = "pressure+direction" if network.directions else "pressure"
-    return Outcome(
+    outcome = Outcome(
         seed,
         case,
         comparison.mse_mm2,
@@ -124,6 +124,26 @@ def fit_one(task: tuple[int, Case, Path]) -> Outcome:
         result.seconds,
         " + ".join([kept, *result.model.effects]),
     )
+    numbers = asdict(outcome)
+    del numbers["case"]
+    write_json(outcome_file(task), numbers)
+    return outcome
+
+
+def outcome_file(task: tuple[int, Case, Path]) -> Path:
+    """File of the numbers of one fitted model."""
+    seed, case, folder = task
+    return folder / f"{model_name(seed, case)}.json"
+
+
+def stored(task: tuple[int, Case, Path]) -> Outcome | None:
+    """The outcome of an earlier run in this folder, None where there is none."""
+    file = outcome_file(task)
+    if not file.is_file():
+        return None
+    numbers = read_json(file)
+    points = tuple(numbers.pop("per_key_point_mm"))
+    return Outcome(case=task[1], per_key_point_mm=points, **numbers)
 
 
 def model_name(seed: int, case: Case) -> str:
@@ -137,32 +157,40 @@ def run(
     points: int | None,
     processes: int,
     report: Progress,
+    work: Path,
     images: Path | None = None,
 ) -> str:
-    """Run the whole study and return its Markdown; `images`: folder for pictures of one robot."""
-    tasks_of = cases()
-    with tempfile.TemporaryDirectory(prefix="surgisoft-") as temporary:
-        folder = Path(temporary)
-        floors = {}
-        for number, seed in enumerate(seeds):
-            report(number, len(seeds), f"collecting robot {seed}")
-            floors[seed] = collect(seed, folder, points)
-        tasks = [(seed, case, folder) for seed in seeds for case in reversed(tasks_of)]
-        outcomes = []
-        context = multiprocessing.get_context("spawn")
-        with context.Pool(processes, begin_worker) as pool:
-            for outcome in pool.imap_unordered(fit_one, tasks):
-                outcomes.append(outcome)
-                report(len(outcomes), len(tasks), f"robot {outcome.seed}: {outcome.case.name}")
-        if images is not None:
-            draw(seeds[0], folder, images)
+    """Run the whole study and return its Markdown.
+
+    work: folder of recordings, models and numbers; what an earlier run left there is not repeated.
+    images: folder for pictures of one robot.
+    """
+    folder = work / ("paper" if points is None else f"{points}-points")
+    folder.mkdir(parents=True, exist_ok=True)
+    floors = {}
+    for number, seed in enumerate(seeds):
+        report(number, len(seeds), f"collecting robot {seed}")
+        kept = folder / f"floor-{seed}.json"
+        if not kept.is_file():
+            write_json(kept, collect(seed, folder, points))
+        floors[seed] = float(read_json(kept))
+    tasks = [(seed, case, folder) for seed in seeds for case in reversed(cases())]
+    outcomes = [outcome for task in tasks if (outcome := stored(task)) is not None]
+    left = [task for task in tasks if not outcome_file(task).is_file()]
+    context = multiprocessing.get_context("spawn")
+    with context.Pool(processes, begin_worker) as pool:
+        for outcome in pool.imap_unordered(fit_one, left):
+            outcomes.append(outcome)
+            report(len(outcomes), len(tasks), f"robot {outcome.seed}: {outcome.case.name}")
+    if images is not None:
+        draw(seeds[0], folder, images)
     return markdown(seeds, floors, outcomes)
 
 
 def draw(seed: int, folder: Path, images: Path) -> None:
     """Draw loops of three models on an amplitude ladder, and bodies of the best, of one robot."""
-    from surgisoft.diagnosis.pages.pictures import body, ladder_loops, save
-    from surgisoft.diagnosis.residuals import residuals
+    from surgisoft.diagnosis.pages.pictures import bodies, ladder_loops, save
+    from surgisoft.diagnosis.residuals import residual_table
     from surgisoft.measurement.recordings import load_recording
     from surgisoft.surrogate.checkpoint import load_model
 
@@ -175,11 +203,11 @@ def draw(seed: int, folder: Path, images: Path) -> None:
         "with hysteresis": cases()[-1],
     }
     models = {label: load_model(folder / model_name(seed, c)) for label, c in picked.items()}
-    rests = {label: residuals(model, [ladder]) for label, model in models.items()}
+    tables = {label: residual_table(model, [ladder]) for label, model in models.items()}
     images.mkdir(parents=True, exist_ok=True)
-    save(ladder_loops(rests, "kPa"), images / "loops.png")
-    best = models["with hysteresis"]
-    save(body(residuals(best, [test]), best.backbone()), images / "body.png")
+    save(ladder_loops(tables, "kPa"), images / "loops.png")
+    best = residual_table(models["with hysteresis"], [test])
+    save(bodies({"with hysteresis": best}), images / "body.png")
 
 
 def removed(outcomes: list[Outcome], floors: dict[int, float], seed: int) -> float:

@@ -1,11 +1,12 @@
 """Models of real robots: error beside black boxes, and coverage of intervals, on held-out runs.
 
-    python -m benchmarks.real_models RECORDING.parquet [--actuation commanded] [--folds 5]
+    python -m benchmarks.real_models RECORDING.parquet [--network auto] [--actuation commanded]
 
 Runs, or blocks of time of a single run, are dealt into folds. Each fold is left out once; on the
-others a model is fitted as `surgisoft fit --prior arcs --effects auto --members 5` does, and three
-black boxes are too. None of them sees the left-out fold before it is judged there; what each of
-them chooses by held-out data, it chooses inside the other folds.
+others a model is fitted as `surgisoft fit` does with the options `--network`, `--prior`,
+`--effects`, `--members` and `--epochs`, and three black boxes are too. None of them sees the
+left-out fold before it is judged there; what each of them chooses by held-out data, it chooses
+inside the other folds.
 
 Black boxes: the recurrent network of `fit --network recurrent`; ridge regression on the actuation
 and its low passes, with all products of two; and kernel ridge regression (Gaussian kernel, Nystroem
@@ -147,8 +148,17 @@ def regressions(x: np.ndarray, y: np.ndarray, group: np.ndarray, at: np.ndarray)
     return found
 
 
-def judge(history: History, spec: ArmSpec, left_out: torch.Tensor, config: FitConfig) -> list[Fold]:
-    """Fit to all rows but the left-out ones, a (R, T) mask, and judge on these."""
+def judge(
+    history: History,
+    spec: ArmSpec,
+    left_out: torch.Tensor,
+    config: FitConfig,
+    recurrent: bool = True,
+) -> list[Fold]:
+    """Fit to all rows but the left-out ones, a (R, T) mask, and judge on these.
+
+    recurrent: whether the recurrent network is among the black boxes; it costs most of the time.
+    """
     train = without(history, left_out)
     measured = history.key_points[left_out]
     group = dealt(history)
@@ -166,10 +176,11 @@ def judge(history: History, spec: ArmSpec, left_out: torch.Tensor, config: FitCo
     error = (found.key_points_mm[left_out] - measured).norm(dim=-1)
     radius = found.radius_mm[left_out]
     folds = [Fold("this model", error.square().numpy(), (error <= radius).numpy(), radius.numpy())]
-    recurrent = fit(train, None, spec, FitConfig(network="recurrent", epochs=50))
-    with torch.no_grad():
-        points = recurrent.model.predict(history)[left_out]
-    folds.append(Fold("recurrent network", (points - measured).square().sum(-1).numpy()))
+    if recurrent:
+        black_box = fit(train, None, spec, FitConfig(network="recurrent", epochs=50))
+        with torch.no_grad():
+            points = black_box.model.predict(history)[left_out]
+        folds.append(Fold("recurrent network", (points - measured).square().sum(-1).numpy()))
     x, y = features(history, spec), history.rows(history.key_points).numpy()
     for name, points in regressions(x[kept], y[kept], group.numpy()[kept], x[~kept]).items():
         folds.append(Fold(name, np.square(points - measured.numpy()).sum(-1)))
@@ -187,6 +198,10 @@ def main() -> None:
     parser.add_argument("--epochs", type=int, default=200)
     parser.add_argument("--effects", default="auto")
     parser.add_argument("--prior", default="arcs")
+    parser.add_argument("--network", choices=("haw_nn", "kernel", "auto"), default="haw_nn")
+    parser.add_argument(
+        "--no-recurrent", action="store_true", help="leave out that black box, the slowest"
+    )
     options = parser.parse_args()
     torch.set_num_threads(1)
     with warnings.catch_warnings():
@@ -196,10 +211,13 @@ def main() -> None:
         history_of(recordings, options.actuation),
         arm_spec(recordings, options.actuation),
     )
+    names = tuple(name for name in options.effects.split(",") if name)
+    kernel = options.network == "kernel"  # which has no options of its own
     config = FitConfig(
-        effects=tuple(name for name in options.effects.split(",") if name),
+        network=options.network,
+        effects=() if kernel else names,
         prior=options.prior,
-        members=options.members,
+        members=1 if kernel else options.members,
         epochs=options.epochs,
     )
     group = torch.zeros(history.valid.shape, dtype=torch.long)
@@ -210,7 +228,7 @@ def main() -> None:
     judged = [int(x) - 1 for x in options.judged.split(",") if x] or range(options.folds)
     for number in judged:
         left_out = torch.isin(group, order[number :: options.folds]) & history.valid
-        for fold in judge(history, spec, left_out, config):
+        for fold in judge(history, spec, left_out, config, not options.no_recurrent):
             every.setdefault(fold.name, []).append(fold)
             rmse = np.sqrt(np.nanmean(fold.square_mm2))
             line = f"  fold {number + 1}: {fold.name:20s} {rmse:8.3f} mm"

@@ -9,9 +9,10 @@ goes on where it stopped.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import cycle, groupby
 from pathlib import Path
 from typing import Any
 
@@ -21,26 +22,31 @@ from scipy.stats import binomtest
 from benchmarks.cache import Cache
 from benchmarks.robust_floor import Floor, floor
 from surgisoft.agents.evaluate import bootstrap, evaluate
-from surgisoft.agents.on_rig import RigConfig, on_rig
+from surgisoft.agents.on_rig import RigConfig, named_rig, on_rig
 from surgisoft.agents.policies import open_policy
 from surgisoft.agents.run_folder import RunFolder
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.measurement.histories import arm_spec, history_of
 from surgisoft.measurement.protocols import make_protocol
-from surgisoft.progress import Progress, noted
-from surgisoft.rig import VirtualRig
+from surgisoft.progress import Progress, Stages
+from surgisoft.rig import Rig, VirtualRig
 from surgisoft.rig.hidden import HIDDEN
 from surgisoft.surrogate.checkpoint import save_model
 from surgisoft.surrogate.fit import FitConfig, fit
 from surgisoft.tasks.base import Task
 from surgisoft.tasks.registry import config_of, make_task, with_fields
+from surgisoft.tasks.world.arm import Randomisation
 
 TASK = "circle_ablation"
 """The task that is judged."""
-DEVELOPMENT = range(19)
+DEVELOPMENT = range(21)
 """Seeds of robots on which the observer's constants were chosen, or that earlier results show."""
 MINUTES_POINTS = 12_000
 """Samples of a robot's own recording: ten minutes of `mixed` at 20 Hz."""
+SIDE_BY_SIDE = 300
+"""Most episodes in one batch, a count: the cost of a step hardly grows up to some hundred."""
+POSES = Randomisation.history
+"""Usual number of random pressures before an episode."""
 FIRE_MM = 0.5
 """Measured distance of the beam from its target within which it is released, mm."""
 FILTER, LEARNS = "filter", "learns"
@@ -83,8 +89,11 @@ class Study:
     """Names of the hidden effects."""
     exact: bool = True
     """Whether FCL decides about contact; else the engine of training."""
+    poses: int = POSES
+    """Random pressures, 4 s each, before an episode: observers that learn learn from them."""
     seed: int = 2000
-    """Seed of the episodes, which no training has."""
+    """Seed of the episodes, which no training has; robots that are judged together have different
+    episodes of it."""
 
     def __post_init__(self):
         known = [robot for robot in (*self.robots, *self.hidden_robots) if robot in DEVELOPMENT]
@@ -130,6 +139,74 @@ class Row:
     """Least clearance."""
 
 
+@dataclass(frozen=True)
+class Case:
+    """One robot with one method: what a `Row` is made of, and its place in the cache."""
+
+    method: Method
+    """What drives the arms."""
+    model: str
+    """`DEFAULT` or `OWN`."""
+    robot: int
+    """Seed of the robot."""
+    hidden: str
+    """Name of the hidden effect; empty without one."""
+    episodes: int
+    """Number of episodes."""
+    seed: int
+    """Seed of the episodes."""
+    exact: bool
+    """Whether FCL decides about contact."""
+    poses: int
+    """Random pressures before an episode."""
+
+    @property
+    def name(self) -> str:
+        """Name of the case in the cache."""
+        return f"{self.method.name}-{self.robot}".replace(" ", "-")
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """What the results depend on."""
+        poses = {} if self.poses == POSES else {"poses": self.poses}
+        return {
+            **poses,
+            "policy": _identity(self.method.policy),
+            "observer": self.method.observer,
+            "model": self.model,
+            "robot": self.robot,
+            "hidden": self.hidden,
+            "episodes": self.episodes,
+            "seed": self.seed,
+            "exact": self.exact,
+        }
+
+    def place(self, cache: Cache) -> Path:
+        """File of the case's results."""
+        return cache.place(self.name, self.about).with_suffix(".json")
+
+    def kept(self, cache: Cache, make: Callable[[], dict[str, list]]) -> dict[str, list]:
+        """Results out of the cache, which `make` gives where they are not there."""
+        return cache.values(self.name, self.about, make)
+
+
+def _absent(case: Case) -> dict[str, list]:
+    raise InputError(f"robust: the result of {case.name} went missing from the folder of the study")
+
+
+def _together(cases: Sequence[Case]) -> Iterator[list[Case]]:
+    """Cases in groups whose episodes run side by side: one method, one arm model, one length."""
+
+    def alike(case: Case) -> tuple:
+        own = case.robot if case.model == OWN else None
+        return case.method, case.model, own, case.episodes
+
+    for _, same in groupby(cases, alike):
+        some = list(same)
+        size = max(1, SIDE_BY_SIDE // some[0].episodes)
+        yield from (some[first : first + size] for first in range(0, len(some), size))
+
+
 def run(study: Study, folder: Path, report: Progress) -> tuple[list[Row], list[Floor]]:
     """Judge all methods; cases that are in the folder are not judged again."""
     kept = Cache(folder / "cases")
@@ -146,26 +223,27 @@ def run(study: Study, folder: Path, report: Progress) -> tuple[list[Row], list[F
         for hidden in study.hidden
         for robot in study.hidden_robots
     ]
+    cases = [
+        Case(method, model, robot, hidden, episodes, study.seed, study.exact, study.poses)
+        for method, model, robot, hidden, episodes in jobs
+    ]
+    missing = [case for case in cases if not case.place(kept).is_file()]
+    stages = Stages(report, len(missing))
+    for some in _together(missing):
+        first, arm = some[0], None
+        note = f"{first.method.name}, model {first.model}, robot {first.robot} {first.hidden}"
+        stage = stages.stage(len(some), f"{note.strip()} and {len(some) - 1} further cases")
+        if first.model == OWN:
+            arm = own_model(first.robot, folder)
+        for case, values in zip(some, _judged(some, arm, stage), strict=True):
+            case.kept(kept, lambda values=values: values)
     rows = []
-    for number, (method, model, robot, hidden, episodes) in enumerate(jobs):
-        note = f"{method.name}, model {model}, robot {robot} {hidden}".strip()
-        report(number, len(jobs), note)
-        about = {
-            "policy": _identity(method.policy),
-            "observer": method.observer,
-            "model": model,
-            "robot": robot,
-            "hidden": hidden,
-            "episodes": episodes,
-            "seed": study.seed,
-            "exact": study.exact,
-        }
-        arm = None if model == DEFAULT else own_model(robot, folder, noted(report, note))
-        make = partial(_judged, method, arm, robot, hidden, episodes, study.seed, study.exact)
-        values = kept.values(f"{method.name}-{robot}".replace(" ", "-"), about, make)
-        rows.append(Row(method.name, model, robot, hidden, **values))
-    about = {"floor": list(study.robots)}
-    floors = kept.values("floor", about, lambda: [asdict(floor(robot)) for robot in study.robots])
+    for case in cases:
+        values = case.kept(kept, partial(_absent, case))
+        rows.append(Row(case.method.name, case.model, case.robot, case.hidden, **values))
+    about = {"floor": list(study.robots), "poses": study.poses}
+    robots, poses = study.robots, study.poses
+    floors = kept.values("floor", about, lambda: [asdict(floor(r, poses)) for r in robots])
     return rows, [Floor(**each) for each in floors]
 
 
@@ -176,7 +254,7 @@ def _identity(policy: str) -> str:
     return str(RunFolder(policy).checkpoint("best").stat().st_size) + RunFolder(policy).path.name
 
 
-def own_model(robot: int, folder: Path, report: Progress) -> Path:
+def own_model(robot: int, folder: Path) -> Path:
     """Folder of the model that is fitted to ten minutes of a robot; made once."""
     place = folder / "models" / f"robot-{robot}"
     if not (place / "config.json").is_file():
@@ -189,27 +267,22 @@ def own_model(robot: int, folder: Path, report: Progress) -> Path:
     return place
 
 
-def _judged(
-    method: Method,
-    arm: Path | None,
-    robot: int,
-    hidden: str,
-    episodes: int,
-    seed: int,
-    exact: bool,
-) -> dict[str, list]:
-    """Fields of a `Row` from the episodes of one robot; exact: FCL decides about contact."""
-    task = _task(method.policy, arm)
-    config = RigConfig(
-        seed=robot,
-        hidden=((hidden, 1.0),) if hidden else (),
-        adapts=method.observer == LEARNS,
-    )
-    place = on_rig(task, config)
-    found = evaluate(place, method.name, open_policy(method.policy, place), episodes, seed, exact)
+def _judged(cases: Sequence[Case], arm: Path | None, report: Progress) -> list[dict[str, list]]:
+    """Fields of a `Row` for each of the cases, whose episodes run side by side.
+
+    Episode i of the seed is on the robot of case i // episodes. arm: folder of the model, None for
+    that of the package.
+    """
+    one = cases[0]
+    task = _task(arm, one.poses)
+    config = RigConfig(adapts=one.method.observer == LEARNS)
+    place = on_rig(task, config, Robots(cases))
+    policy = open_policy(one.method.policy, place)
+    count = len(cases) * one.episodes
+    found = evaluate(place, one.method.name, policy, count, one.seed, one.exact, count, report)
     each = found.per_episode
     allowed = task.steps * task.world.config.dt_s
-    return {
+    columns = {
         "cut": [bool(value) for value in each["success"]],
         "contact": [bool(value) for value in each["collided"]],
         "beam_error_mm": _plain(each["beam_error_mean_mm"]),
@@ -218,11 +291,35 @@ def _judged(
         "share_on": _plain(each["time_s"] / allowed),
         "clearance_mm": _plain(each["clearance_mm"]),
     }
+    size = one.episodes
+    return [
+        {name: values[first : first + size] for name, values in columns.items()}
+        for first in range(0, count, size)
+    ]
 
 
-def _task(policy: str, arm: Path | None) -> Task:
+class Robots:
+    """Makes the rigs of episodes that run side by side, each on the robot of its case.
+
+    Every arm is asked for one rig to check, and then for the rigs of all episodes in their order.
+    """
+
+    def __init__(self, cases: Sequence[Case]):
+        self._rows = cycle([case for case in cases for _ in range(case.episodes)])
+        self._first = cases[0]
+
+    def __call__(self, config: RigConfig, trial: int) -> Rig:
+        """The rig of a trial; 0 is that of the check."""
+        case = next(self._rows) if trial else self._first
+        hidden = ((case.hidden, 1.0),) if case.hidden else ()
+        return named_rig(replace(config, seed=case.robot, hidden=hidden), trial)
+
+
+def _task(arm: Path | None, poses: int) -> Task:
     """The task with its usual rules, and the model of the package or one of the robot."""
     config: Any = with_fields(config_of(TASK), fire_mm=FIRE_MM)
+    vary = replace(config.world.randomisation, history=poses)
+    config = replace(config, world=replace(config.world, randomisation=vary))
     return make_task(TASK, config if arm is None else with_fields(config, arm=str(arm)))
 
 
@@ -260,7 +357,8 @@ def markdown(rows: list[Row], floors: list[Floor], study: Study) -> str:
         f"`{TASK}` with the beam released within {FIRE_MM} mm of its target, as measured; "
         f"{study.episodes} episodes (seed {study.seed}) on each of the robots {robots} of the "
         "virtual rig. None of them took part in a training, a fit of the package, or a choice of a "
-        "constant. Errors are true ones; "
+        f"constant. Before an episode each arm goes through {study.poses} random pressures, 4 s "
+        "each. Errors are true ones; "
         f"{'FCL' if study.exact else 'the engine of training'} decides about contact. Rates with "
         "Wilson's 95 % interval, means with a bootstrap over the robots.",
         "",

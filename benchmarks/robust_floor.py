@@ -23,7 +23,7 @@ from surgisoft.surrogate.reach import steady_key_points
 from surgisoft.tasks.inverse_kinematics import Pointing
 from surgisoft.tasks.registry import make_task
 from surgisoft.tasks.world.adaptation import DisturbanceEstimator
-from surgisoft.tasks.world.arm import ModelArm
+from surgisoft.tasks.world.arm import ModelArm, Randomisation
 from surgisoft.tasks.world.observer import AlphaBetaFilter
 
 APPROACH_S = 5.0
@@ -63,15 +63,15 @@ def _ring() -> tuple[ModelArm, np.ndarray, np.ndarray, np.ndarray]:
 
 
 @torch.no_grad()
-def floor(robot: int) -> Floor:
-    """The floor with the cameras of a robot."""
+def floor(robot: int, poses: int = Randomisation.history) -> Floor:
+    """The floor with the cameras of a robot; poses: random pressures before the episode."""
     arm, pressures, points, targets = _ring()
     rig = VirtualRig(robot)
     reads = round(0.1 / rig.period_s)
     before = round(HELD_S / rig.period_s)
     random = np.random.default_rng(robot)
     low, high = rig.limits.T
-    held = [*random.uniform(low, high, (3, len(low))), pressures[0]]
+    held = [*random.uniform(low, high, (poses, len(low))), pressures[0]]
     rig.reset()
     noise, at = [], []
     for target, count in [*((p, before) for p in held), *((p, reads) for p in pressures[1:])]:

@@ -47,8 +47,12 @@ def fit(
         ),
     ] = None,
     network: Annotated[
-        Literal["haw_nn", "constant_curvature", "recurrent"],
-        typer.Option(help="HAW-NN, or one of two baselines."),
+        Literal["haw_nn", "kernel", "auto", "constant_curvature", "recurrent"],
+        typer.Option(
+            help="haw_nn: HAW-NN; kernel: arcs and kernel regression on the actuation and its low "
+            "passes, for few data; auto: haw_nn and kernel, of which held-out data choose one; "
+            "constant_curvature and recurrent: baselines."
+        ),
     ] = "haw_nn",
     prior: Annotated[
         Literal["none", "arcs"],

@@ -211,7 +211,7 @@ class Refit:
             return f"{text}; {others} would do about as well"
         return (
             f"{text}; {others} would do about as well, but the model's input is a command, which "
-            "has to pass the line: measure the actuation to tell them"
+            "has to pass the line: measure the actuation to tell them apart"
         )
 
     def of(self, effect: str) -> RefitCandidate:
@@ -600,7 +600,7 @@ def check_trainable(model: ArmModel, effects: Iterable[str] = ()) -> None:
         kind = model.summary().partition(" (")[0]
         raise InputError(
             f"{kind} has no network that could be trained together with effects: expected a model "
-            "that 'surgisoft fit' made; pass --refit never"
+            "of 'surgisoft fit' with --network haw_nn; or pass --refit never"
         )
     for name in effects:
         stage = known_effects()[name].stage

@@ -547,11 +547,11 @@ class Chain:
         """(S, n, 3, m) derivative of the key points by the effective actuation, mm a unit.
 
         first: (R, m) actuation at which each run begins; taps: those of a scan of the history;
-        rows: picks the rows (S, ...) of a (R, T, ...) tensor. Of a callable with memory: by an
-        actuation that is offset during the whole run.
+        rows: picks the rows (S, ...) of a (R, T, ...) tensor. Of a network that takes whole runs:
+        by an actuation that is offset during the whole run.
         """
         actuation = taps.behind["material"]
-        if isinstance(self.net, CallableNetwork) and self.net.whole_runs:
+        if self.net.whole_runs:
             memory = self.standing(first, signals=False)[0].memory.get(NETWORK)
             return self.net.slope_along(actuation, history, memory, rows)
         return self.network_slope(rows(actuation), rows(taps.direction))

@@ -30,7 +30,13 @@ from surgisoft.surrogate.effects import ArmFacts, Effect, effect_class, register
 from surgisoft.surrogate.effects.user_defined import check_files, files_of
 from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.model import ArmModel, Validation, arm_facts
-from surgisoft.surrogate.networks import ConstantCurvature, HawEnsemble, HawNN, RecurrentArm
+from surgisoft.surrogate.networks import (
+    ConstantCurvature,
+    HawEnsemble,
+    HawNN,
+    KernelArm,
+    RecurrentArm,
+)
 from surgisoft.surrogate.training_residuals import FILE as RESIDUALS_FILE
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 
@@ -50,6 +56,7 @@ OWN_FILES = ("config.json", "weights.safetensors", "report.json", RESIDUALS_FILE
 NETWORKS = {
     "haw_nn": (HawNN, ("key_points", "hidden", "directions", "arcs")),
     "haw_ensemble": (HawEnsemble, ("key_points", "hidden", "directions", "members", "arcs")),
+    "kernel": (KernelArm, ("key_points", "arcs", "landmarks", "times_s")),
     "constant_curvature": (ConstantCurvature, ("key_points", "sections")),
     "recurrent": (RecurrentArm, ("key_points", "width")),
     "callable": (CallableNetwork, ("key_points", "name", "sha256")),

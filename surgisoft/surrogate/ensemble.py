@@ -16,7 +16,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from surgisoft.surrogate.interval import ErrorInterval, calibrate, distance_to
+from surgisoft.surrogate.interval import ErrorInterval, calibrate, distance_across
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import HawEnsemble, HawNN, range_weights
 from surgisoft.surrogate.training import (
@@ -27,7 +27,6 @@ from surgisoft.surrogate.training import (
     dealt,
     measured_rows,
 )
-from surgisoft.surrogate.training_residuals import ROWS
 
 MOST_ELEMENTS = 2**22
 """Largest number of activations of a layer that are evaluated at once."""
@@ -98,7 +97,7 @@ def train_ensemble(
     left = (_left_out(average, rows, fold) - target).where(known, torch.nan)
     signal = history.rows(history.pressure)[seen]
     signal = signal if data.held is None else signal[free]
-    distance = _distances(signal, fold, model)
+    distance = distance_across(signal, fold, torch.tensor(model.spec.span))
     interval = calibrate(left.norm(dim=-1), distance, group, "cross-validation")
     return model.replace(network=average), interval
 
@@ -136,15 +135,3 @@ def _left_out(ensemble: HawEnsemble, rows: list[Tensor], fold: Tensor) -> Tensor
         each = ensemble.each(rows[0][part], rows[1][part])
         found.append(each[fold[part], torch.arange(len(part))])
     return torch.cat(found)
-
-
-def _distances(actuation: Tensor, fold: Tensor, model: ArmModel) -> Tensor:
-    """(S,) distance of each row's actuation to the nearest of the other folds, in ranges."""
-    span = torch.tensor(model.spec.span)
-    thin = torch.arange(0, len(fold), max(1, -(-len(fold) // ROWS)))
-    apart = torch.zeros(len(fold))
-    for number in fold.unique():
-        mine, others = fold == number, thin[fold[thin] != number]
-        if len(others):
-            apart[mine] = distance_to(actuation[mine], actuation[others], span)
-    return apart

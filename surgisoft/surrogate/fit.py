@@ -28,8 +28,9 @@ from surgisoft.surrogate.ensemble import train_ensemble
 from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.interval import ErrorInterval, calibrate, coverage_of, distance_to
+from surgisoft.surrogate.kernel_fit import KernelFit, fit_kernel
 from surgisoft.surrogate.model import ArmModel
-from surgisoft.surrogate.networks import HIDDEN, ConstantCurvature, HawEnsemble, HawNN
+from surgisoft.surrogate.networks import HIDDEN, ConstantCurvature, HawEnsemble, HawNN, KernelArm
 from surgisoft.surrogate.prior_mean import arcs_of, fit_prior_mean
 from surgisoft.surrogate.scan import direction_scan
 from surgisoft.surrogate.training import (
@@ -38,6 +39,7 @@ from surgisoft.surrogate.training import (
     Rows,
     dealt,
     held_rows,
+    measured_rows,
     model_rows,
     new_recurrent,
     normalise,
@@ -164,6 +166,9 @@ def _signed(pieces: list[np.ndarray], direction: np.ndarray):
         start += len(piece)
 
 
+NETWORKS = ("haw_nn", "constant_curvature", "recurrent", "kernel", "auto")
+GREY_BOXES = ("haw_nn", "auto")
+"""Networks that a prior mean, members and effects are options of."""
 PRIORS = ("none", "arcs")
 INPUTS = ("pressure", "pressure+direction")
 SIMPLE_SHARE = 0.2
@@ -200,7 +205,8 @@ class FitConfig:
     """Settings of a fit."""
 
     network: str = "haw_nn"
-    """`haw_nn`, `constant_curvature` or `recurrent`."""
+    """`haw_nn`, `constant_curvature`, `recurrent`, `kernel` (arcs, and kernel regression with
+    memory of what they leave) or `auto` (`haw_nn` and `kernel`, of which held-out data choose)."""
     inputs: str = "pressure+direction"
     """`pressure` or `pressure+direction`."""
     effects: tuple[str, ...] = ()
@@ -245,6 +251,8 @@ class StageReport:
     """Why the stage was rejected; empty if it was accepted."""
     simpler_rmse_mm: float | None = None
     """Held-out RMSE of the simpler model trained just as long, mm."""
+    settings: str = ""
+    """What cross-validation chose for the stage; empty where it chose nothing."""
     tried_mm: dict[str, float] = field(default_factory=dict)
     """Held-out RMSE of each effect with which `auto` compared the stage's, after a short training,
     mm; `none`: without any."""
@@ -293,6 +301,7 @@ class FitResult:
             f"{stage.epochs:4d} epochs {stage.seconds:6.1f} s  "
             f"{'kept' if stage.kept else 'left out'}"
             + (f" (without it {stage.simpler_rmse_mm:.4f} mm)" if stage.simpler_rmse_mm else "")
+            + (f" ({stage.settings})" if stage.settings else "")
             for stage in self.stages
         ]
         for stage in self.stages:
@@ -346,6 +355,8 @@ def fit(
     result.warnings.extend(_still_chambers(train, spec))
     if config.network == "recurrent":
         _fit_recurrent(data, spec, config, result, progress)
+    elif config.network == "kernel":
+        _fit_kernel(data, spec, config, result, progress)
     else:
         validated = excitation(data.validation, low, high, band)
         support = _Support(result.excitation, all(chamber.minor_loops for chamber in validated))
@@ -364,6 +375,8 @@ def fit(
         rows = data.validation_rows(result.model)
         validation = validated_error(rows.target, model_rows(result.model, rows))
         result.model.validation = replace(validation, interval=interval)
+        if config.network == AUTO:
+            _compare_kernel(data, spec, config, result, progress)
     _state_interval(data, result)
     validation = replace(result.model.validation, noise_mm=data.validation.noise_mm)
     result.model.validation = validation
@@ -410,7 +423,9 @@ def _fit_recurrent(data: Data, spec, config, result: FitResult, progress) -> Non
 def _check(train: History, valid: History | None, spec: ArmSpec, config: FitConfig) -> None:
     if config.prior not in PRIORS:
         raise unknown_name("prior mean", config.prior, PRIORS)
-    if config.prior != "none" and config.network != "haw_nn":
+    if config.network not in NETWORKS:
+        raise unknown_name("network", config.network, NETWORKS)
+    if config.prior != "none" and config.network not in (*GREY_BOXES, "kernel"):
         raise InputError(
             f"a prior mean needs the network haw_nn, not {config.network}; change one of the two"
         )
@@ -419,7 +434,7 @@ def _check(train: History, valid: History | None, spec: ArmSpec, config: FitConf
     known = known_effects()
     if not 1 <= config.members <= MOST_MEMBERS:
         raise InputError(f"{config.members} members, expected 1 to {MOST_MEMBERS}")
-    if config.members > 1 and config.network != "haw_nn":
+    if config.members > 1 and config.network not in GREY_BOXES:
         raise InputError(
             f"an ensemble needs the network haw_nn, not {config.network}; change one of the two"
         )
@@ -433,8 +448,13 @@ def _check(train: History, valid: History | None, spec: ArmSpec, config: FitConf
                 f"{name} acts on the {known[name].stage}, behind the network: "
                 f"fit without it, then 'surgisoft amend --effect {name}' adds it"
             )
-    if config.effects and config.network != "haw_nn":
-        raise InputError(f"effects need the network haw_nn; the {config.network} baseline has none")
+    if config.effects and config.network not in GREY_BOXES:
+        raise InputError(
+            f"effects need the network haw_nn; {config.network} is fitted without any, and 'amend' "
+            "or 'improve' adds them to it"
+            if config.network == "kernel"
+            else f"effects need the network haw_nn; the {config.network} baseline has none"
+        )
     for history in (train, valid):
         if history is None:
             continue
@@ -571,9 +591,7 @@ def _add_memory(data: Data, spec, config, support: _Support, result: FitResult, 
     Each candidate is trained together with the network for a share of the epochs, and so is the
     model without any. The best one then goes through a stage of its own, as if it had been named.
     """
-    timed = bool((data.train.dt_s > 0).any()) and (
-        data.train.stood is None or bool(data.train.stood.isfinite().any())
-    )
+    timed = _timed(data.train)
     names = [name for name in MEMORY_EFFECTS if timed or name == MEMORY_EFFECTS[-1]]
     if not timed:
         result.warnings.append(
@@ -610,6 +628,76 @@ def _add_memory(data: Data, spec, config, support: _Support, result: FitResult, 
         if not result.stages[-1].kept:
             return
         names.remove(best)
+
+
+def _timed(history: History) -> bool:
+    """Whether the rows have a clock: a recording of steady-state samples has none."""
+    stood = history.stood
+    return bool((history.dt_s > 0).any()) and (stood is None or bool(stood.isfinite().any()))
+
+
+def _fit_kernel(data: Data, spec, config, result: FitResult, progress) -> None:
+    """Fit kernel regression with memory and make it the result."""
+    begin = time.perf_counter()
+    found = _kernel(data, spec, config, result, progress)
+    _take_kernel(found, data, result)
+    error_mm = result.model.validation.rmse_mm
+    assert error_mm is not None
+    seconds = time.perf_counter() - begin
+    result.stages.append(StageReport("kernel", error_mm, 0, seconds, True, settings=found.settings))
+
+
+def _kernel(data: Data, spec, config, result: FitResult, progress) -> KernelFit:
+    """Kernel regression with memory; adds its losses to the result."""
+
+    def report(trial: int, trials: int, loss: float) -> None:
+        result.loss.append(("kernel", trial, loss, loss))
+        if progress is not None:
+            progress("kernel", trial, trials, loss)
+
+    return fit_kernel(data, spec, _timed(data.train), config.seed, report)
+
+
+def _take_kernel(found: KernelFit, data: Data, result: FitResult) -> None:
+    """Make kernel regression the result, validated by cross-validation or validation recordings."""
+    measured, predicted = found.measured_mm, found.predicted_mm
+    if data.valid is not None:
+        measured, predicted = _on_validation(found.model, data.valid)
+    result.model = found.model
+    error = validated_error(measured, predicted)
+    result.model.validation = replace(error, interval=found.interval)
+
+
+@torch.no_grad()
+def _on_validation(model: ArmModel, valid: History) -> tuple[Tensor, Tensor]:
+    """(S, n, 3) measured and predicted key points in mm of validation recordings."""
+    seen = measured_rows(valid)
+    return valid.rows(valid.key_points)[seen], valid.rows(model.predict(valid))[seen]
+
+
+def _compare_kernel(data: Data, spec, config, result: FitResult, progress) -> None:
+    """Put kernel regression in the place of the network if the held-out error is less with it."""
+    begin = time.perf_counter()
+    try:
+        found = _kernel(data, spec, config, result, progress)
+    except InputError as error:
+        result.warnings.append(f"kernel regression not tried: {error}")
+        return
+    if data.valid is None:
+        pair = found.measured_mm[found.held], found.predicted_mm[found.held]
+    else:
+        pair = _on_validation(found.model, data.valid)
+    before, after = result.model.validation.rmse_mm, validated_error(*pair).rmse_mm
+    assert before is not None
+    assert after is not None
+    kept = after < before
+    reason = "" if kept else "the network has less held-out error"
+    seconds = time.perf_counter() - begin
+    result.stages.append(
+        StageReport("kernel", after, 0, seconds, kept, reason, before, found.settings)
+    )
+    if kept:
+        _take_kernel(found, data, result)
 
 
 def _ensemble(data: Data, config, result: FitResult, progress) -> ErrorInterval | None:
@@ -652,10 +740,14 @@ def _network_inputs(model: ArmModel, rows: Rows) -> tuple[Tensor, Tensor]:
 def _state_interval(data: Data, result: FitResult) -> None:
     """Calibrate the interval on the held-out rows, or measure its coverage there.
 
-    The coverage is measured where other rows calibrated the interval (those that members of an
-    ensemble left out).
+    The coverage is measured where other rows calibrated the interval: those that members of an
+    ensemble left out, or all rows of the training where there are validation recordings. Kernel
+    regression takes part in all rows of the training, so nothing is measured without these.
     """
     model = result.model
+    interval = model.validation.interval
+    if interval is not None and isinstance(model.network, KernelArm) and data.valid is None:
+        return
     history, span = data.validation, torch.tensor(model.spec.span)
     with torch.no_grad():
         error = (model.predict(history) - history.key_points).norm(dim=-1)
@@ -664,7 +756,6 @@ def _state_interval(data: Data, result: FitResult) -> None:
     fitted = data.train.pressure[data.train.valid if data.held is None else ~data.held]
     thin = fitted[:: max(1, -(-len(fitted) // ROWS))]
     distance = distance_to(history.pressure[held], thin, span)
-    interval = model.validation.interval
     if interval is not None:
         result.covered = coverage_of(error[held], interval.radius_mm(distance))
         return

@@ -12,6 +12,11 @@ et al. 2018, sec. 5.2), with the distance d to the nearest actuation of the trai
 d is the Euclidean distance in actuation, each chamber in shares of its range. Far from the training
 data the interval widens; how much, is chosen among `GROWTHS` so that the mean radius at `LEVEL` is
 least. That growth is 0 where distance does not matter.
+
+A further run differs from all of those that were scored, so the quantile of few runs covers too
+little of it. Each group of rows is therefore left out of the scores in turn, and all quantiles are
+multiplied by the least factor, at least 1, with which the quantiles of the others cover the groups
+left out (the jackknife of Barber et al. 2021, by groups). Where groups are alike it is near 1.
 """
 
 import math
@@ -28,6 +33,10 @@ GROWTHS = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0)
 """Growths of the score's scale by distance that are tried, per range of a chamber."""
 LEAST_GAIN = 0.05
 """Least fall of the mean radius that a growth has to bring, as a share of the radius without."""
+REFERENCE_ROWS = 1500
+"""Most rows of the training among which the nearest actuation is looked for."""
+MOST_GROUPS = 50
+"""Most groups that are left out one by one; of more groups the quantiles hardly depend on one."""
 LEAST_ROWS = 100
 """Fewest rows with a measured key point from which its quantiles are taken."""
 
@@ -98,6 +107,20 @@ def distance_to(actuation: Tensor, reference: Tensor, span: Tensor) -> Tensor:
     return torch.cat([torch.cdist(part, there).amin(1) for part in at.split(4096)])
 
 
+def distance_across(actuation: Tensor, fold: Tensor, span: Tensor) -> Tensor:
+    """(S,) distance of each row's actuation (S, m) to the nearest of other folds, in ranges (m,).
+
+    Of the other folds' rows REFERENCE_ROWS are taken, evenly thinned.
+    """
+    thin = torch.arange(0, len(fold), max(1, -(-len(fold) // REFERENCE_ROWS)))
+    apart = torch.zeros(len(fold))
+    for number in fold.unique():
+        mine, others = fold == number, thin[fold[thin] != number]
+        if len(others):
+            apart[mine] = distance_to(actuation[mine], actuation[others], span)
+    return apart
+
+
 def calibrate(error: Tensor, distance: Tensor, group: Tensor, source: str) -> ErrorInterval | None:
     """The interval of errors on rows that the training left out; None for too few rows.
 
@@ -118,14 +141,39 @@ def calibrate(error: Tensor, distance: Tensor, group: Tensor, source: str) -> Er
     if radii[growth] > (1 - LEAST_GAIN) * radii[0.0]:
         growth = 0.0
     scores = error / (1 + growth * distance)[:, None]
+    widest, quantiles = torch.zeros_like(scores[0]), []
+    for level in LEVELS:
+        wide = group_factor(scores, group, level) * _quantiles(scores, level)
+        widest = torch.maximum(widest, wide)
+        quantiles.append(tuple(widest.tolist()))
     return ErrorInterval(
         LEVELS,
-        tuple(tuple(_quantiles(scores, level).tolist()) for level in LEVELS),
+        tuple(quantiles),
         growth,
         len(error),
         len(group.unique()),
         source,
     )
+
+
+def group_factor(scores: Tensor, group: Tensor, level: float) -> float:
+    """Least factor >= 1 on quantiles by which those of all other groups cover each group left out.
+
+    scores: (S, n), NaN where missing; group: (S,) number of the run or block of each row; level:
+    share of the scores of all groups left out to cover. 1 for a single group, or more than
+    `MOST_GROUPS`.
+    """
+    names = group.unique()
+    if not 1 < len(names) <= MOST_GROUPS:
+        return 1.0
+    ratios = torch.full_like(scores, torch.nan)
+    for name in names:
+        mine = group == name
+        others = scores[~mine]
+        if int((~others.isnan()).sum(0).min()) < LEAST_ROWS:
+            return 1.0
+        ratios[mine] = scores[mine] / _quantiles(others, level).clamp(min=1e-12)
+    return max(1.0, float(_quantiles(ratios.flatten()[:, None], level)[0]))
 
 
 def _quantiles(scores: Tensor, level: float) -> Tensor:

@@ -17,7 +17,13 @@ from surgisoft.surrogate.effects import STAGES, ArmFacts, Context, Effect, Stage
 from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.interval import LEVEL, ErrorInterval, distance_to
-from surgisoft.surrogate.networks import ConstantCurvature, HawEnsemble, HawNN, RecurrentArm
+from surgisoft.surrogate.networks import (
+    ConstantCurvature,
+    HawEnsemble,
+    HawNN,
+    KernelArm,
+    RecurrentArm,
+)
 from surgisoft.surrogate.training_residuals import ROWS, TrainingResiduals
 
 AWAY_SHARE = 0.15
@@ -25,7 +31,13 @@ AWAY_SHARE = 0.15
 share of its range."""
 
 Network = (
-    HawNN | HawEnsemble | ConstantCurvature | RecurrentArm | CallableNetwork | PredictedNetwork
+    HawNN
+    | HawEnsemble
+    | KernelArm
+    | ConstantCurvature
+    | RecurrentArm
+    | CallableNetwork
+    | PredictedNetwork
 )
 """Networks that the chain may have; the last two stand for models of other origin."""
 
@@ -318,6 +330,9 @@ class ArmModel(nn.Module):
         kind = type(self.network).__name__
         if isinstance(self.network, HawEnsemble):
             kind = f"{self.network.members} x HawNN"
+        if isinstance(self.network, KernelArm):
+            kind = f"arcs + kernel regression on {self.network.landmarks} landmarks"
+            kind += " with memory" * self.network.remembers
         if isinstance(self.network, CallableNetwork):
             kind = f"callable {self.network.name}"
         if isinstance(self.network, PredictedNetwork):

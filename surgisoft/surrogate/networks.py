@@ -1,10 +1,11 @@
-"""Networks from actuation to key points: HAW-NN, ensembles of it, and two baselines.
+"""Networks from actuation to key points: HAW-NN, its ensembles, kernel regression, two baselines.
 
 HAW-NN is the Hysteresis-Aware Whole-body Neural Network of Chen et al. (2025, sec. III-A).
 """
 
 import itertools
 import math
+from collections.abc import Callable, Sequence
 from typing import cast
 
 import torch
@@ -12,6 +13,8 @@ from torch import Tensor, nn
 
 from surgisoft.errors import InputError
 from surgisoft.surrogate.arm import centre_and_half
+from surgisoft.surrogate.history import History
+from surgisoft.surrogate.scan import linear_scan
 
 HIDDEN = (128, 128, 128, 128)
 """Best of the paper's six architectures: 4 hidden layers of 128 neurons."""
@@ -389,6 +392,154 @@ class ArcChain(nn.Module):
             turn = turn @ arc_rotation(bend)
             points.append(place + unit * (turn @ offset))
         return torch.stack(points, -2)
+
+
+class KernelArm(nn.Module):
+    """Chain of arcs plus kernel regression of what it leaves, on actuation and its fading memory.
+
+    With the scaled actuation p, its low passes q_k of the time constants tau_k, and landmarks x_l,
+
+        key points = arcs(p) + sum_l w_l exp(-|x - x_l|^2 / 2),   x = a [p, b (p - q_1), ...].
+
+    This is the mean of a Gaussian process with the arcs as its prior mean (Rasmussen & Williams
+    2006, sec. 2.7), on landmarks (Nyström approximation, Williams & Seeger 2001): far from the data
+    it returns to the arcs. A bank of low passes represents a fading memory (Boyd & Chua 1985); in
+    steady state all p - q_k are zero.
+    """
+
+    centre: Tensor
+    half_range: Tensor
+    times: Tensor
+    input_weight: Tensor
+    places: Tensor
+
+    directions = runs_only = False
+
+    def __init__(
+        self,
+        low: Tensor,
+        high: Tensor,
+        key_points: int,
+        arcs: int,
+        landmarks: int,
+        times_s: Sequence[float] = (),
+    ):
+        """Pressure range low, high (m,) in the arm's unit; `key_points` is n.
+
+        arcs: as in `ArcChain`; landmarks: number L of landmarks; times_s: time constants of the K
+        low passes of each chamber, s; none: the key points depend on the present actuation alone.
+        """
+        super().__init__()
+        self.key_points, self.arcs, self.landmarks = key_points, arcs, landmarks
+        self.times_s = tuple(float(time) for time in times_s)
+        self.prior = ArcChain(low, high, key_points, arcs)
+        centre, half = centre_and_half(low, high)
+        inputs = len(low) * (1 + len(self.times_s))
+        self.register_buffer("centre", centre)
+        self.register_buffer("half_range", half)
+        self.register_buffer("times", torch.tensor(self.times_s), persistent=False)
+        self.register_buffer("input_weight", torch.ones(inputs))
+        self.register_buffer("places", torch.zeros(landmarks, inputs))
+        self.weight = nn.Parameter(torch.zeros(landmarks, 3 * key_points))
+
+    @property
+    def remembers(self) -> bool:
+        """Whether there are low passes."""
+        return bool(self.times_s)
+
+    @property
+    def whole_runs(self) -> bool:
+        """Whether key points depend on more than the row's own actuation."""
+        return self.remembers
+
+    def rest(self, pressure: Tensor) -> Tensor:
+        """(B, m, K) low passes of arms that have stood at pressure (B, m)."""
+        return pressure.unsqueeze(-1).expand(*pressure.shape, len(self.times_s)).clone()
+
+    def advance(self, memory: Tensor, pressure: Tensor, direction: Tensor, dt_s: Tensor) -> Tensor:
+        """(B, m, K) low passes after pressure (B, m) was held for dt_s (B,) seconds."""
+        return torch.lerp(pressure.unsqueeze(-1), memory, self._keep(dt_s))
+
+    def _keep(self, dt_s: Tensor) -> Tensor:
+        """(..., 1, K) share of a low pass's lag that is left after dt_s (...) seconds."""
+        return torch.exp(-dt_s[..., None, None] / self.times)
+
+    def inputs(self, pressure: Tensor, memory: Tensor | None = None) -> Tensor:
+        """(..., m (1 + K)) scaled actuation and lags, before weights.
+
+        pressure: (..., m) in the arm's unit; memory: (..., m, K) low passes of it, None in
+        steady state.
+        """
+        x = (pressure - self.centre) / self.half_range
+        if not self.remembers:
+            return x
+        if memory is None:
+            memory = pressure.unsqueeze(-1).expand(*pressure.shape, len(self.times_s))
+        lag = (pressure.unsqueeze(-1) - memory) / self.half_range.unsqueeze(-1)
+        return torch.cat([x, lag.flatten(-2)], -1)
+
+    def forward(self, pressure: Tensor, direction: Tensor, memory: Tensor | None = None) -> Tensor:
+        """Key points (..., n, 3) in mm, base frame, from pressure (..., m), low passes (..., m, K).
+
+        memory: None stands for steady state.
+        """
+        x = self.inputs(pressure, memory) * self.input_weight
+        near = gaussian_kernel(x, self.places)
+        return self.prior(pressure) + (near @ self.weight).unflatten(-1, (self.key_points, 3))
+
+    def lows(self, actuation: Tensor, history: History, memory: Tensor | None) -> Tensor:
+        """(R, T, m, K) low passes along actuation (R, T, m) of a history's runs.
+
+        memory: (R, m, K) before the first row; None: of arms that have stood at the first row's.
+        """
+        keep = self._keep(history.dt_s.to(actuation))
+        start = self.rest(actuation[:, 0]) if memory is None else memory
+        start = start.expand(len(actuation), *start.shape[1:])
+        return linear_scan(keep, (1 - keep) * actuation.unsqueeze(-1), start)
+
+    def along(self, actuation: Tensor, history: History, memory: Tensor | None) -> Tensor:
+        """Key points (R, T, n, 3) in mm along effective actuation (R, T, m) of a history's runs.
+
+        memory: (R, m, K) low passes before the first row.
+        """
+        low = self.lows(actuation, history, memory)
+        parts = zip(
+            actuation.flatten(0, 1).split(KERNEL_ROWS),
+            low.flatten(0, 1).split(KERNEL_ROWS),
+            strict=True,
+        )
+        points = torch.cat([self(pressure, pressure, low) for pressure, low in parts])
+        return points.unflatten(0, actuation.shape[:2])
+
+    def slope_along(
+        self,
+        actuation: Tensor,
+        history: History,
+        memory: Tensor | None,
+        rows: Callable[[Tensor], Tensor],
+    ) -> Tensor:
+        """(S, n, 3, m) derivative of key points by a constant offset of each chamber, mm a unit.
+
+        The offset holds for the whole run, so that the low passes have it too. rows: picks the rows
+        (S, ...) of a (R, T, ...) tensor.
+        """
+        pressure, low = rows(actuation), rows(self.lows(actuation, history, memory))
+        with torch.enable_grad():
+            at = pressure.detach().clone().requires_grad_(True)
+            points = self(at, at, low + (at - at.detach()).unsqueeze(-1))
+            coordinates = points.flatten(1).unbind(1)
+            slopes = [torch.autograd.grad(c.sum(), at, retain_graph=True)[0] for c in coordinates]
+        return torch.stack(slopes, 1).unflatten(1, points.shape[1:])
+
+
+KERNEL_ROWS = 1 << 14
+"""Rows whose kernels are held at once; of each there is a number for every landmark."""
+
+
+def gaussian_kernel(x: Tensor, places: Tensor) -> Tensor:
+    """(..., L) exp(-|x - place|^2 / 2) of inputs (..., F) and places (L, F)."""
+    half = x.square().sum(-1, keepdim=True) + places.square().sum(-1)
+    return torch.exp((x @ places.T - half / 2).clamp(max=0))
 
 
 class RecurrentArm(nn.Module):

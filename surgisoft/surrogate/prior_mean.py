@@ -43,9 +43,19 @@ def fit_prior_mean(prior: ArcChain, history: History, rest: Tensor) -> None:
     prior.set_rest(rest)
     points = history.rows(history.key_points)
     seen = (~points.isnan()).all(-1).any(-1)
-    step = max(1, -(-int(seen.sum()) // MOST_ROWS))
-    points = points[seen][::step].double()
-    pressure = history.rows(history.pressure)[seen][::step].double()
+    fit_arcs(prior, history.rows(history.pressure)[seen], points[seen])
+
+
+def fit_arcs(
+    prior: ArcChain, pressure: Tensor, points: Tensor, iterations: int = ITERATIONS
+) -> None:
+    """Fit a chain of arcs, from its present parameters, to measured rows, evenly thinned.
+
+    pressure: (S, m) in the arm's unit; points: (S, n, 3) measured key points, mm, NaN where
+    missing; iterations: most of them.
+    """
+    step = max(1, -(-len(points) // MOST_ROWS))
+    pressure, points = pressure[::step].double(), points[::step].double()
     known, points = ~points.isnan(), points.nan_to_num()
     count = known.sum().clamp(min=1) / 3
     mean = points.sum(0) / known.sum(0).clamp(min=1)
@@ -53,7 +63,7 @@ def fit_prior_mean(prior: ArcChain, history: History, rest: Tensor) -> None:
     prior.double()
     parameters = list(prior.parameters())
     optimiser = torch.optim.LBFGS(
-        parameters, max_iter=ITERATIONS, history_size=30, line_search_fn="strong_wolfe"
+        parameters, max_iter=iterations, history_size=30, line_search_fn="strong_wolfe"
     )
 
     def loss() -> Tensor:

@@ -4,10 +4,12 @@ import math
 
 import pytest
 import torch
+from torch.distributions import Normal, kl_divergence
 
 from surgisoft.agents.policies import Random, open_policy
 from surgisoft.agents.policy_network import (
     LEAST_COMPILED,
+    ActionNoise,
     CompiledTanh,
     ScaledActor,
     compile_activations,
@@ -96,3 +98,27 @@ def test_a_training_computes_every_tanh_by_the_compiled_one(task):
     assert [type(layer) for layer in actor.mlp].count(CompiledTanh) == 2
     assert list(actor.state_dict()) == names
     assert torch.allclose(actor.mlp(seen), before, atol=1e-5)
+
+
+@pytest.mark.parametrize("last_noise", [None, 0.05])
+def test_the_noise_of_actions_is_that_of_independent_normal_distributions(last_noise):
+    noise = empty_actor("arm", 5, 3, Preset(last_noise=last_noise)).distribution
+    assert isinstance(noise, ActionNoise)
+    with torch.no_grad():
+        noise.log_std_param.copy_(torch.tensor([-1.5, 0.2, -0.1]))
+    mean, outputs, old_mean = torch.randn(3, 50, 3)
+    old = torch.tensor([0.4, 0.9, 1.3]).expand(50, 3)
+    noise.update(mean)
+    deviation = noise.log_std_param.exp()
+    truth = Normal(mean, deviation.expand(50, 3))
+    found = noise.log_prob(outputs), noise.entropy
+    true = truth.log_prob(outputs).sum(1), truth.entropy().sum(1)
+    for one, other in zip(found, true, strict=True):
+        assert torch.allclose(one, other, atol=1e-5)
+    apart = noise.kl_divergence((old_mean, old), noise.params)
+    assert torch.allclose(apart, kl_divergence(Normal(old_mean, old), truth).sum(1), atol=1e-5)
+    assert noise.log_std_param.requires_grad is (last_noise is None)
+    if last_noise is None:
+        sums = [one.sum() + other.sum() for one, other in (found, true)]
+        slopes = [torch.autograd.grad(each, noise.log_std_param)[0] for each in sums]
+        assert torch.allclose(*slopes, rtol=1e-4)

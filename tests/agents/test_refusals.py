@@ -15,6 +15,7 @@ import torch
 
 from surgisoft.agents.controller import ControllerGraph
 from surgisoft.agents.controller_runner import Controller
+from surgisoft.agents.distributed import processes
 from surgisoft.agents.exact_checks import ExactChecks
 from surgisoft.agents.export import export
 from surgisoft.agents.learned import check_fits
@@ -23,7 +24,7 @@ from surgisoft.agents.observer import ObserverGains
 from surgisoft.agents.on_rig import RigConfig, on_rig
 from surgisoft.agents.presets import Plan, Preset
 from surgisoft.agents.run_folder import PACKAGED, RunFolder, check_free
-from surgisoft.agents.session import evaluate
+from surgisoft.agents.session import EvaluationRequest, evaluate
 from surgisoft.agents.training import Result
 from surgisoft.agents.training_request import TrainedRun, shortfall, train
 from surgisoft.errors import InputError
@@ -286,3 +287,22 @@ def test_an_engine_that_is_not_installed_is_named(packaged, tmp_path, monkeypatc
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(ImportError, match=r"onnx \(asked for: onnxruntime\)"):
         Controller(tmp_path, "onnxruntime")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_device_that_is_not_there_is_one_line():
+    for device, message in (
+        ("cuda", "--device 'cuda': PyTorch finds no GPU; use --device cpu"),
+        ("tpu", "--device 'tpu': expected cpu or cuda"),
+    ):
+        with pytest.raises(InputError, match=message), processes(device):
+            pass
+
+
+def test_a_run_of_another_task_is_told_of(packaged):
+    told: list[str] = []
+    request = EvaluationRequest((packaged,), "track_circle", config=SHORT)
+    task, _ = request.resolved(told.append)
+    assert task.name == "track_circle"
+    assert len(told) == 1
+    assert re.search(r"run was trained on \w+, not on track_circle$", told[0])

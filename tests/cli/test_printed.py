@@ -50,7 +50,7 @@ def comparison(name: str, **fields) -> SimpleNamespace:
         "floor": SimpleNamespace(rmse_mm=0.05, source="holds"), "samples": 20, "missing": 0,
         "components_mm": {"x": 0.1, "y": 0.2}, "mse_mm2": 0.25, "per_key_point_mm": [0.25, NAN],
         "coverage": None, "time_shift": None, "axes": (), "change_axes": (), "worst": (),
-        "explainable": None, "rmse_ci95_mm": (0.4, 0.6),
+        "explainable": None, "rmse_ci95_mm": (0.4, 0.6), "in_fit": 0.0, "rows_of_fit": "",
     }  # fmt: skip
     table = SimpleNamespace(model=SimpleNamespace(summary=lambda: "an arm"))
     numbers = result(**(values | fields))
@@ -134,7 +134,8 @@ def diagnosis(**fields) -> SimpleNamespace:
         "verdict": SimpleNamespace(kind="setup", sentence="the frame is turned"),
         "error_mm": SimpleNamespace(before=0.5, floor=0.05, ceiling=0.1), "track": None,
         "setup": None, "next_command": "", "next_experiment": None, "refit": None, "checks": (),
-        "shown": (), "not_testable": (), "seconds": 1.5,
+        "shown": (), "not_testable": (), "seconds": 1.5, "in_fit": 0.0,
+        "left_out": "held-out blocks",
     }  # fmt: skip
     return result(**(values | fields))
 
@@ -229,7 +230,7 @@ def test_amend_and_improve_write_nothing_where_nothing_is_claimed(
     ]  # fmt: skip
     found = result(
         claimed=False, rounds=rounds, steps=[("creep", 0.3)], parameters=[PARAMETER, UNITLESS],
-        held_out=SimpleNamespace(before=0.5, floor=0.1), sentence="no significant fall",
+        held_out=SimpleNamespace(before=0.5, floor=0.1, in_fit=0.0), sentence="no significant fall",
     )  # fmt: skip
     command = ["improve", "default", rec, "-o", new, "--json", numbers + ".json"]
     target = "surgisoft.diagnosis.improve.improve"
@@ -254,7 +255,7 @@ def test_amend_and_improve_write_nothing_where_nothing_is_claimed(
         "amend", "default", "--effect", "creep", "--data", rec, "-o", new, code=1,
     )  # fmt: skip
     assert "creep: the model had this effect already; its parameters were fitted again\n" in out
-    assert "the network's last layer was fitted again, which lowers the error on held-out" in out
+    assert "the network's last layer was fitted again, which lowers the error on motion th" in out
     assert "creep lowers it, with parts of the training data left out\n" in out
     assert f"{new} was not written; --anyway writes it nevertheless" in out
     assert not Path(new).exists()
@@ -463,3 +464,180 @@ def test_a_group_without_a_command_prints_its_help(capsys):
     shown = capsys.readouterr()
     assert "Usage: surgisoft scene" in shown.out
     assert shown.err == ""
+
+
+def test_what_is_claimed_is_written_with_its_page(bench, tmp_path, capsys, monkeypatch):
+    saved = []
+    for module in ("surgisoft.cli.amend", "surgisoft.cli.improve"):
+        monkeypatch.setattr(f"{module}.save_amended", lambda made, new, *_: saved.append(str(new)))
+        view = f"{module}.write_before_and_after"
+        monkeypatch.setattr(view, lambda made, tables, name, file: file)
+    monkeypatch.setattr("surgisoft.diagnosis.compare.tables_of", lambda *_: {})
+    pages = "surgisoft.diagnosis.pages.amendment"
+    monkeypatch.setattr(f"{pages}.amend_page", lambda made, title, about: title)
+    monkeypatch.setattr("surgisoft.report.write_page", lambda page, file: f"{file}: {page}")
+    monkeypatch.setattr(
+        f"{pages}.write_improve_report", lambda made, tables, folder, title: [f"{folder}: {title}"]
+    )
+    rec, new, page = str(bench / "bench.parquet"), str(tmp_path / "new"), str(tmp_path / "page")
+    numbers, replay = str(tmp_path / "n.json"), str(tmp_path / "r.rrd")
+    options = ["-o", new, "--json", numbers, "--report", page, "--replay", replay]
+    found = result(
+        claimed=True, rounds=[], steps=[], parameters=[], effects=("creep",), refitted=(),
+        retuned=False, refit=None, sentence="the error falls",
+        model=SimpleNamespace(summary=lambda: "an arm", fitted_rows=None),
+    )  # fmt: skip
+    out = printed(
+        capsys, monkeypatch, "surgisoft.diagnosis.improve.improve", found,
+        "improve", "default", rec, *options,
+    )  # fmt: skip
+    assert "What default lacks on bench" in out
+    assert "the error falls\n" in out
+    assert f"wrote {new}: an arm\nnext, both on a recording that took no part: surg" in out
+    assert saved == [new]
+    Path(numbers).unlink()
+    out = printed(
+        capsys, monkeypatch, "surgisoft.diagnosis.amend.amend", found,
+        "amend", "default", "--effect", "creep", "--data", rec, *options, "--force",
+    )  # fmt: skip
+    assert saved == [new, new]
+    assert Path(numbers).read_text().strip() == "{}"
+    assert f"{Path(page) / 'report.html'}: default with creep\n" in out
+
+
+def test_an_import_names_what_looks_wrong(bench, tmp_path, capsys, monkeypatch):
+    from surgisoft.measurement.recordings import load_recording
+
+    some = load_recording(bench / "bench.parquet")
+    parts = [SimpleNamespace(recording=some, notes=("the clock was set",))]
+    monkeypatch.setattr("surgisoft.measurement.importing.load_map", lambda path: {})
+    monkeypatch.setattr("surgisoft.measurement.importing.import_files", lambda *_: parts)
+    wrong = SimpleNamespace(sample=4, text="a jump of 30 mm")
+    monkeypatch.setattr("surgisoft.measurement.recordings.find_warnings", lambda rec: [wrong])
+    faults = "surgisoft.diagnosis.setup.find_setup_faults"
+    monkeypatch.setattr(faults, lambda *_: None)
+    new = str(tmp_path / "new.parquet")
+    command = ["import", "raw.csv", "--map", "m.toml", "-o", new, "--dry-run"]
+    assert run([*command, "--model", "default"]) == 0
+    shown = capsys.readouterr()
+    assert "note: the clock was set\n" in shown.out
+    assert f"would write {new}: " in shown.out
+    assert shown.out.endswith("set-up: no fault that default shows\n")
+    assert f"{new}, row 5: a jump of 30 mm" in shown.err
+    monkeypatch.setattr(
+        faults, lambda *_: found_setup(sentence="turned by 90 degrees", recordings=("bench",))
+    )
+    assert run([*command, "--model", "default"]) == 0
+    assert "set-up: turned by 90 degrees" in capsys.readouterr().err
+    parts.append(parts[0])
+    assert run(command) == 2
+    assert "new.parquet: 2 recordings, expected a folder for them" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_experiment_that_takes_something_away_is_told_by_hand(
+    bench, tmp_path, capsys, monkeypatch
+):
+    pair = SimpleNamespace(effects=("creep", "payload"), before=0.5, after=0.9)
+    model, rec, new = "default", str(bench / "bench.parquet"), str(tmp_path / "new.csv")
+    target = "surgisoft.diagnosis.design.next_experiment.next_experiment"
+    monkeypatch.setattr("surgisoft.diagnosis.design.schedules.schedule_text", lambda plan: "x")
+    commands = SimpleNamespace(commands=np.zeros((2, 3)), unit="kPa", run_rows=[2])
+    fields = {
+        "name": "walk", "minutes": 5.0, "why": "it tells them apart", "steps": ["unmount it"],
+        "protocol": commands, "options": "--payload 5", "removes": ("payload",), "pairs": [pair],
+        "separates": [], "open": (),
+    }  # fmt: skip
+    monkeypatch.setattr("surgisoft.cli.next_experiment.warn_all", lambda notes: None)
+    for by_hand, said in (
+        (True, "  the virtual rig has no option for that change: --as-it-stands asks for none\n"),
+        (False, f"  on the virtual rig: surgisoft collect {new} --payload 5 -o NEW.parquet\n"),
+    ):
+        plan = result(**(fields | {"by_hand": by_hand}))
+        out = printed(
+            capsys, monkeypatch, target, plan, "next-experiment", model, rec, "-o", new
+        )  # fmt: skip
+        Path(new).unlink()
+        assert said in out
+        assert (f" {rec} NEW.parquet" in out) is not by_hand
+        assert ("--without payload" in out) is by_hand
+        assert "creep or payload: expected chance of the right one 0.50 -> 0.90" in out
+
+
+def test_no_mounts_are_one_line_with_what_was_repaired(tmp_path, capsys, monkeypatch):
+    from surgisoft.scene.author import NoMounts
+
+    def none(*_):
+        raise NoMounts("the laser reaches 40 % of the ring", ("organ.stl: unit mm",))
+
+    monkeypatch.setattr("surgisoft.scene.author.author", none)
+    organ = tmp_path / "organ.stl"
+    organ.touch()
+    new = tmp_path / "scene"
+    command = ["scene", "new", str(organ), "--lesion", "0", "0", "0", "-o", str(new)]
+    assert run(command) == 1
+    out = capsys.readouterr().out
+    assert out.endswith(
+        "organ.stl: unit mm\nNo scene was written: the laser reaches 40 % of the ring.\n"
+    )
+    assert not new.exists()
+
+
+def test_an_export_without_a_controller_says_why(tmp_path, capsys, monkeypatch):
+    run_of = SimpleNamespace(task=lambda: None)
+    monkeypatch.setattr(
+        "surgisoft.agents.learned.LearnedPolicy", lambda *_, **__: SimpleNamespace(run=run_of)
+    )
+    (tmp_path / "policy.json").write_text('{"note": "it sees images"}')
+    out = printed(
+        capsys, monkeypatch, "surgisoft.agents.export.export", [tmp_path / "policy.onnx"],
+        "export", "runs/x", "-o", str(tmp_path),
+    )  # fmt: skip
+    assert "controller: not exported, only the policies: it sees images\n" in out
+    assert out.endswith(f"wrote {tmp_path / 'policy.onnx'}\n")
+    (tmp_path / "controller.py").touch()
+    monkeypatch.setattr("surgisoft.agents.controller_runner.Controller", lambda folder: None)
+    check = SimpleNamespace(decisions=30, points_mm=0.00123, commands_kPa=0.5)
+    monkeypatch.setattr("surgisoft.agents.rig_check.check_on_rig", lambda *_: check)
+    assert run(["export", "runs/x", "-o", str(tmp_path), "--check"]) == 0
+    assert (
+        "on the virtual rig, 30 decisions: exported controller and policy differ by 0.0012 mm"
+        in (capsys.readouterr().out)
+    )
+
+
+def test_an_interrupted_recording_says_where_its_log_is(tmp_path, capsys, monkeypatch):
+    new = tmp_path / "new.parquet"
+
+    def interrupted(*_, log=None, **__):
+        log.write_text("half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("surgisoft.rig.trial.collect", interrupted)
+    rig = "tests.rig.own_rig:OwnRig:port=x"
+    assert run(["collect", "walk", "--rig", rig, "-o", str(new)]) == 130
+    error = capsys.readouterr().err
+    (log,) = tmp_path.iterdir()
+    assert f"what was measured so far is in {log}, which every command opens as a" in error
+
+
+@pytest.mark.parametrize(
+    ("words", "incomplete", "expected"),
+    [
+        ([], "task=track_c", ["task=track_circle"]),
+        (["task=track_circle"], "follow.weights.f", ["follow.weights.fine="]),
+        (["task=nowhere"], "minu", ["minutes="]),
+        (["--task", "track_circle"], "follow.loop_", ["follow.loop_s="]),
+    ],
+)
+def test_fields_are_completed_for_the_task_that_is_named(
+    words, incomplete, expected, capsys, monkeypatch
+):
+    line = ["surgisoft", "train", *words]
+    monkeypatch.setenv("_SURGISOFT_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", " ".join([*line, incomplete]))
+    monkeypatch.setenv("COMP_CWORD", str(len(line)))
+    with pytest.raises(SystemExit) as ended:
+        run([])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out.split() == expected

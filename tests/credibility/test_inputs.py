@@ -103,7 +103,8 @@ def test_the_sentence_follows_from_error_uncertainty_and_criteria():
     def said(error, uncertainty, *criteria) -> str:
         body = PointError("body", error, None, uncertainty, 0.1)
         names = {field.name: None for field in dataclasses.fields(Assessment)}
-        return Assessment(**names | {"points": (body,), "criteria": criteria}).sentence
+        known = {"points": (body,), "criteria": criteria, "comparators": ()}
+        return Assessment(**names | known).sentence
 
     kept, broken = Criterion("a", 1.0, 2.0, "mm"), Criterion("b", 3.0, 2.0, "mm")
     assert said(1.0, 0.4).endswith("0.6 and 1.4 mm; area metric 0.1 mm; no limits are given")

@@ -70,7 +70,7 @@ def test_rows_of_a_reference_are_fitted_and_not_judged():
         judged = fold == number
         np.testing.assert_allclose(found.grams[:, number], one.grams[:, 0], rtol=1e-5, atol=1e-4)
         np.testing.assert_allclose(
-            found.held_out[:, judged[:10]], one.held_out[:, judged], rtol=1e-4, atol=1e-4
+            found.held_out[..., judged[:10]], one.held_out[..., judged], rtol=1e-4, atol=1e-4
         )
 
 

@@ -115,7 +115,7 @@ def test_the_sentence_of_a_refit_names_what_would_do_as_well():
     assert both.sentence.endswith("; creep would do about as well")
     assert (both.ambiguous, both.names) == (True, ("line_lag", "creep"))
     line = refit("line_lag", ("creep",), of_line=True)
-    assert line.sentence.endswith("has to pass the line: measure the actuation to tell them")
+    assert line.sentence.endswith("has to pass the line: measure the actuation to tell them apart")
     assert not line.ambiguous
     assert none.to_json()["not_tried"] == [{"effect": "drift", "why": "static"}]
     weak = (("plausible", False), ("p_value", 0.5), ("gain", 0.0), ("log_gain", 0.0))

@@ -74,6 +74,16 @@ def test_the_best_alone_gives_way_to_the_two_that_are_best_together(table):
     assert [score.effect for score in two.instead] == ["blend", "blend"]
 
 
+def test_a_proposal_is_tested_when_its_tests_are_read(table, monkeypatch):
+    """`compare` asks what the effects leave, and nothing else."""
+    asked = []
+    monkeypatch.setattr(selection, "relaxed_fit", lambda _, named: asked.append(len(named)))
+    one, two = selection.propose(table, table.scores())
+    assert (one.chosen, two.chosen, asked) == ((0,), (2, 1), [])
+    assert two.relaxed is two.relaxed
+    assert asked == [2]
+
+
 def test_an_effect_of_the_fit_is_not_proposed_for_what_the_fit_left(table, monkeypatch):
     monkeypatch.setattr(table, "in_fit", lambda effect: effect == "blend", raising=False)
     assert selection.propose(table, table.scores())[0].effects == ("right",)

@@ -1,12 +1,14 @@
 """What results made by hand say: amendments, diagnoses and what is left after an experiment."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from surgisoft.diagnosis.amend import Amendment, Fall
+from surgisoft.diagnosis.data_quality import LONG_ROWS, data_quality_warnings, thinning_notes
 from surgisoft.diagnosis.decision import (
     ASSET,
     Decision,
@@ -18,7 +20,8 @@ from surgisoft.diagnosis.decision import (
 from surgisoft.diagnosis.design.schedules import SETUPS
 from surgisoft.diagnosis.diagnose import ErrorLevels, effect_left, next_command, sentence_of
 from surgisoft.diagnosis.improve import Improvement
-from surgisoft.diagnosis.other_models import callable_arm, open_model
+from surgisoft.diagnosis.other_models import callable_arm, open_model, polynomial_of
+from surgisoft.diagnosis.weight import under_weight
 from surgisoft.errors import InputError
 from surgisoft.surrogate.callables.named import given_callable
 from tests.diagnosis.synthetic import recording, still_model, walk
@@ -225,3 +228,60 @@ def test_models_of_other_origin_that_do_not_fit():
         open_model(still_model(), [some], error_mm=0.5)
     opened = open_model(still_model(), [some])
     assert opened.model.spec.chambers == 2
+
+
+def test_a_model_of_a_bench_that_stood_otherwise_is_diagnosed_with_loads_of_any_direction():
+    some = recording(np.zeros(60), walk(60))
+    plain = still_model()
+    down, aside = (0.0, 0.0, -1.0), (1.0, 0.0, 0.0)
+    stood = plain.replace(spec=replace(plain.spec, gravity=down))
+    here, there = replace(some, gravity=down), replace(some, gravity=aside)
+    assert under_weight(plain, [there]) == (plain, [])
+    assert under_weight(stood, [some]) == (stood, [])
+    assert under_weight(stood, [here]) == (stood, [])
+    changed, notes = under_weight(stood, [there])
+    assert changed.spec.gravity is None
+    assert (
+        "the weight pulls along (1.00, 0.00, 0.00), 90 degrees from (0.00, 0.00, -1.00)"
+        in (notes[0])
+    )
+    assert "stands for the arm's own weight as well there" in notes[1]
+    for several in ([here, there], [there, some]):
+        same, notes = under_weight(stood, several)
+        assert same is stood
+        assert "give those of one direction at a time" in notes[1]
+
+
+def test_warnings_about_recordings_are_a_sentence_each():
+    def problem(**fields):
+        values = {
+            "table": SimpleNamespace(floor=SimpleNamespace(source="stated")), "floor_mm": 0.1,
+            "motion": np.arange(8), "measured": np.zeros((10, 2, 3)),
+            "model": SimpleNamespace(validation=SimpleNamespace(rmse_mm=0.05)), "reference": None,
+        }  # fmt: skip
+        return SimpleNamespace(**(values | fields))
+
+    holes = np.zeros((10, 2, 3))
+    holes[:5] = np.nan
+    unknown = SimpleNamespace(floor=SimpleNamespace(source="unknown"))
+    held = SimpleNamespace(floor=SimpleNamespace(source="holds"))
+    for fields, message in (
+        ({}, None),
+        ({"measured": holes}, "50 % of the key points are missing"),
+        ({"motion": np.zeros(8, int)}, "their 8 blocks of time show 1 different motions"),
+        ({"table": unknown}, "state noise_mm in the sidecar for a better noise floor"),
+        ({"table": held}, "scatter by 0.1 mm, more than the model's whole validated error (0.05"),
+    ):
+        found = data_quality_warnings(problem(**fields))
+        assert len(found) == (message is not None)
+        assert message is None or message in found[0]
+    many = SimpleNamespace(block_of_row=np.zeros(LONG_ROWS, int), index=np.arange(1000))
+    (note,) = thinning_notes(many)
+    assert f"{LONG_ROWS:,} rows are thinned: effects are fitted to 1,000 of them" in note
+    assert thinning_notes(SimpleNamespace(block_of_row=np.zeros(9, int))) == ()
+
+
+def test_a_polynomial_needs_predictions():
+    some = recording(np.zeros(60), walk(60))
+    with pytest.raises(InputError, match="me: the recordings have no predicted key points; name"):
+        polynomial_of([some], still_model().spec, "me")

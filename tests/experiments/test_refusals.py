@@ -1,5 +1,6 @@
 """Experiments that cannot be meant, and rare ways through those that can."""
 
+import json
 import re
 import shutil
 from dataclasses import replace
@@ -13,12 +14,13 @@ from surgisoft.errors import InputError
 from surgisoft.experiments.controllers import PhaseControllers, Schedule
 from surgisoft.experiments.phases import PhasedTask, with_phase_events
 from surgisoft.experiments.plan import build_task, rig_config, scene_of, settings
+from surgisoft.experiments.run import open_results
 from surgisoft.experiments.session import (
     experiments_of,
     start_experiment,
     with_policy,
 )
-from surgisoft.experiments.spec import Fault, Lesion, load_experiment
+from surgisoft.experiments.spec import Fault, Lesion, load_experiment, save_experiment
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.circle_ablation import CircleAblation
 from surgisoft.tasks.laser_supervision import LaserSupervision
@@ -162,3 +164,29 @@ def test_a_fault_after_the_end_is_no_event(phased):
 def test_a_folder_of_experiments_is_that_of_its_scene(tmp_path):
     shutil.copy(write(tmp_path), tmp_path / "second.toml")
     assert [path.name for path in experiments_of(tmp_path)] == ["second.toml", "tiny.toml"]
+
+
+def test_a_copy_of_an_experiment_names_its_files_from_its_own_folder(tmp_path):
+    (tmp_path / "push.csv").write_text("t_s,c1_kPa,c2_kPa,c3_kPa\n0,0,0,0\n1,1,1,1\n")
+    text = TINY + '[[drivers]]\nname = "unused"\nschedule = "push.csv"\n'
+    spec = spec_of(tmp_path, text)
+    (tmp_path / "results").mkdir()
+    save_experiment(spec, tmp_path / "results" / "experiment.toml")
+    assert 'schedule = "../push.csv"' in (tmp_path / "results" / "experiment.toml").read_text()
+    assert load_experiment(tmp_path / "results" / "experiment.toml") == spec
+
+
+def test_results_go_on_only_with_their_own_scene(tmp_path):
+    spec, folder = spec_of(tmp_path), tmp_path / "results"
+    open_results(spec, folder)
+    open_results(spec, folder, resume=True)
+    with pytest.raises(InputError, match="results are already there; --resume continues them"):
+        open_results(spec, folder)
+    with pytest.raises(InputError, match="holds another experiment"):
+        open_results(replace(spec, repeats=spec.repeats + 1), folder, resume=True)
+    about = json.loads((folder / "versions.json").read_text())
+    (folder / "versions.json").write_text(json.dumps(about | {"scene_hash": "0"}))
+    with pytest.raises(InputError, match="has changed since the results began"):
+        open_results(spec, folder, resume=True)
+    with pytest.raises(InputError, match="exists and holds no results of an experiment"):
+        open_results(spec, tmp_path)

@@ -194,6 +194,19 @@ def test_a_short_reference_is_refused():
         fit_detector([residual(20, 1)])
 
 
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"false_alarm_h": 0.0}, "time between false alarms is 0 h, expected 0.001 to 1e6 h"),
+        ({"false_alarm_h": np.inf}, "time between false alarms is inf h"),
+        ({"scale": 1.0}, "scale is 1, expected 1.1 to 100"),
+    ],
+)
+def test_an_alarm_has_a_rate_and_a_scale(fields, message):
+    with pytest.raises(InputError, match=message):
+        AlarmDesign(**fields)
+
+
 def test_motion_that_the_reference_lacks_is_not_judged(detector):
     """An error outside the reference's range of actuation says nothing about a change."""
     t_s, values = residual(120, 10)

@@ -4,17 +4,22 @@ import json
 import math
 import os
 import re
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from scipy.io import savemat
 
+from surgisoft.apart import unpacked
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import actuation_of
 from surgisoft.measurement.importing import draft_map, import_files, load_map
 from surgisoft.measurement.importing.plausible import plausibility_notes
+from surgisoft.measurement.importing.readers import c3d
+from surgisoft.measurement.importing.readers.c3d import as_bytes
 from surgisoft.measurement.importing.rotation import between, check_pose
 from surgisoft.measurement.protocols import Protocol
 from surgisoft.measurement.protocols.schedule_file import load_schedule
@@ -420,3 +425,129 @@ def test_the_tail_of_a_log_that_was_never_written(tmp_path):
 
 def test_folders_of_nothing_are_one_line(tmp_path):
     assert "no .csv or .parquet in this folder" in said(lambda: load_recordings([tmp_path]))
+
+
+TWO = "t,u,x,y,z,a,b,c\n0,1,0,0,0,0,0,9\n1,2,0,0,0,0,1,9\n2,3,0,0,0,0,2,9\n"
+TWO_POINTS = 'positions = [["x", "y", "z"], ["a", "b", "c"]]'
+
+
+@pytest.mark.parametrize(
+    ("points", "more", "raw", "message"),
+    [
+        (
+            TWO_POINTS + "\norder = [0]",
+            "",
+            TWO,
+            "order = [0] in the map, expected numbers of its",
+        ),
+        (TWO_POINTS + "\nlost = [2]", "", TWO, "lost = [2] in the map, expected numbers of its 2"),
+        ('auto = "bodies"', "", TWO, "no key point found, expected rigid bodies in the file's hea"),
+        (
+            TWO_POINTS,
+            '[frame]\nalign_z = "rest"\nrest_rows = 1',
+            TWO.replace("0,9", "0,0"),
+            "align_z needs the first and last key point in the first 1 rows, but they are missing",
+        ),
+        (
+            TWO_POINTS,
+            '[frame]\norigin = "k0"\nrest_rows = 1',
+            TWO.replace("1,0,0,0", "1,,,"),
+            "key point k0 is missing in every row at rest",
+        ),
+    ],
+)
+def test_key_points_that_a_file_does_not_have(points, more, raw, message, tmp_path):
+    text = BASE.format(measured=PLAIN).replace('positions = [["x", "y", "z"]]', points) + more
+    assert message in said(lambda: imported(tmp_path, text, raw))
+
+
+def test_positions_have_a_unit(tmp_path):
+    text = BASE.format(measured=PLAIN).replace('unit = "mm"\n', "")
+    assert "key_points.unit: missing; expected the positions' unit, one of mm, cm, m, in" in said(
+        lambda: imported(tmp_path, text, RAW)
+    )
+
+
+def test_an_actuation_that_is_read_later_than_every_run(tmp_path):
+    text = BASE.format(measured=PLAIN + "\ndelay_s = {}")
+    assert "delay_s 60 (commanded 0) is longer than every run, expected a short time" in said(
+        lambda: imported(tmp_path, text.format(60), RAW)
+    )
+    rows = "".join(f"{0.1 * i:.1f},{i},{i},3,4\n" for i in range(20))
+    (part,) = imported(tmp_path, text.format(0.5), "t,u,x,y,z\n" + rows)
+    assert "measured actuation read +0.5 s from each row (delay_s)" in part.notes
+    assert "5 rows that the late log does not reach left out" in part.notes
+    assert part.recording.measured[:3, 0] == pytest.approx([5.0, 6.0, 7.0])
+
+
+def test_the_topic_of_a_file_of_arrays_is_one_of_its_groups(tmp_path):
+    savemat(tmp_path / "a.mat", {"arm": {"t": np.arange(9.0), "u": np.arange(9.0)}})
+    text = '[file.main]\ntopic = "leg"\n' + BASE.format(measured=PLAIN)
+    (tmp_path / "map.toml").write_text(text)
+    spec = load_map(str(tmp_path / "map.toml"))
+    message = said(lambda: import_files([tmp_path / "a.mat"], spec, "a"))
+    assert message.endswith("no group or struct 'leg', expected one of arm")
+    savemat(tmp_path / "a.mat", {"note": "nothing"})
+    spec = replace(spec, file={"main": replace(spec.file["main"], topic="")})
+    message = said(lambda: import_files([tmp_path / "a.mat"], spec, "a"))
+    assert message.endswith("no array of numbers in it, expected time and measurements")
+
+
+class FakeC3d:
+    """The part of ezc3d that is used, with a file of this content."""
+
+    def __init__(self, frames=4, rate=100.0, volts=0, units=("m",)):
+        rng = np.random.default_rng(0)
+        labels = [f"M{k}" for k in range(2)]
+        self.content = {
+            "parameters": {
+                "POINT": {"LABELS": {"value": labels}, "UNITS": {"value": list(units)}},
+                "ANALOG": {"LABELS": {"value": [f"V{k}" for k in range(volts)]}},
+            },
+            "data": {
+                "points": rng.normal(size=(4, 2, frames)),
+                "analogs": rng.normal(size=(1, volts, 5 * frames)),
+            },
+            "header": {"points": {"frame_rate": rate}},
+        }
+
+    def c3d(self, path):
+        if "broken" in path:
+            raise OSError("the header ends early")
+        return self.content
+
+
+@pytest.mark.parametrize(
+    ("file", "fields", "message"),
+    [
+        ("broken.c3d", {}, "cannot be read as a C3D file (the header ends early)"),
+        ("a.c3d", {"frames": 0}, "holds no frame, expected at least one; export it again"),
+        ("a.c3d", {"rate": 0.0}, "frame rate 0 Hz, expected more than 0"),
+    ],
+)
+def test_c3d_files_without_frames_are_one_line(file, fields, message, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ezc3d", FakeC3d(**fields))
+    assert said(lambda: as_bytes(tmp_path / file)).endswith(f"{file}: {message}")
+
+
+def test_voltages_of_a_c3d_file_are_averaged_over_its_frames(tmp_path, monkeypatch):
+    for volts, units, unit in ((1, ("m",), "m"), (0, (), "mm")):
+        fake = FakeC3d(volts=volts, units=units)
+        monkeypatch.setitem(sys.modules, "ezc3d", fake)
+        facts, (values,) = unpacked(as_bytes(tmp_path / "a.c3d"))
+        assert facts["unit"] == unit
+        assert facts["markers"] == ["M0", "M1"]
+        assert facts["names"][:4] == ["t_s", "M0.x", "M0.y", "M0.z"]
+        assert values.shape == (4, 7 + volts)
+        if volts:
+            assert values[0, -1] == pytest.approx(fake.content["data"]["analogs"][0, 0, :5].mean())
+
+
+def test_a_missing_reader_is_named_with_its_extra(tmp_path, monkeypatch):
+    (tmp_path / "a.c3d").write_bytes(b"t,u")
+    for found, expected in (
+        (None, "needs the package ezc3d, which is not installed: pip install 'surgisoft[lab]'"),
+        (object(), "its first bytes are not those of a C3D file; export it again"),
+    ):
+        monkeypatch.setattr(c3d, "find_spec", lambda name, found=found: found)
+        assert expected in said(lambda: c3d.READER.read(tmp_path / "a.c3d", None))

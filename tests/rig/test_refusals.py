@@ -14,6 +14,7 @@ from surgisoft.measurement.protocols import Protocol
 from surgisoft.rig import SafeRig, Safety, VirtualRig, open_rig
 from surgisoft.rig.drivers.line_protocol import Data, Info, line, words_of
 from surgisoft.rig.drivers.motion_capture import decode_json
+from surgisoft.rig.drivers.serial_rig import open_motion_capture
 from surgisoft.rig.emulator import emulated, main
 from surgisoft.rig.lerobot import NamedRig
 from surgisoft.rig.registry import hidden_of, rig_options
@@ -57,6 +58,9 @@ def simulated(port: str = "x") -> VirtualRig:
         ("elastica:payload_g=1000", "payload is 1000.0 g, expected 0 to"),
         ("elastica:noise=-1", "noise scale is -1.0, expected a number >= 0"),
         ("elastica:elements=3", "elements is 3, expected at least 6"),
+        ("elastica:hidden=haunting", "unknown hidden effect 'haunting'"),
+        ("elastica:hidden=creep/creep", "hidden effect 'creep' is given twice, expected once"),
+        ("elastica:hidden=creep:11", "strength of 'creep' is 11.0, expected 0 to 10"),
     ],
 )
 def test_a_rig_that_cannot_be_opened_is_one_line(text, message):
@@ -221,3 +225,11 @@ def test_the_emulator_says_what_it_needs(tmp_path, capsys):
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@pytest.mark.parametrize(
+    "text", ["udp:0", "udp:x", "udp:70000", "natnet:", "natnet:here:0", "natnet:here:x", "vicon:1"]
+)
+def test_motion_capture_comes_by_udp_or_from_a_natnet_server(text):
+    with pytest.raises(InputError, match="expected udp:PORT or natnet:SERVER"):
+        open_motion_capture(text, "127.0.0.1", time.monotonic)

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from surgisoft.errors import InputError
 from surgisoft.scene.ablation import AblationMap
@@ -199,8 +200,6 @@ def test_targets_that_are_no_scene_are_kept(tmp_path):
 
 def test_requests_that_contradict_each_other(tmp_path):
     stl = tmp_path / "a.stl"
-    import trimesh
-
     trimesh.creation.icosphere(radius=50.0).export(stl)
     (tmp_path / "b.nii").write_bytes(b"x")
     point = tmp_path / "point.obj"
@@ -316,3 +315,63 @@ def test_labels_that_make_no_body_are_one_line(tmp_path):
     assert "unknown role 'ghost'" in said(lambda: parse_label("1:ghost"))
     two = [parse_label("1:organ"), parse_label("2:organ")]
     assert "2 labels with the role organ and 0" in said(lambda: read_segmentation(path, two))
+
+
+def test_files_after_the_first_have_its_unit_unless_their_format_has_one(tmp_path):
+    ball_of = trimesh.creation.icosphere(subdivisions=2, radius=50.0)
+    for name in ("a.stl", "b.stl"):
+        ball_of.export(tmp_path / name)
+    ball_of.apply_scale(1e-3).export(tmp_path / "c.glb")
+    found = prepare(
+        Request(
+            meshes=tuple(tmp_path / name for name in ("a.stl", "b.stl", "c.glb")),
+            roles=("organ", "keep-out", "support"),
+        )
+    )
+    units = [note for note in found.notes if ": unit " in note]
+    assert units[1] == "b.stl: unit that of a.stl"
+    assert units[2].startswith("c.glb: unit m")
+    assert "c.glb: y points up; another axis needs --up" in found.notes
+    assert "3 bodies: a (organ), b (keep-out), " in found.notes[-1]
+    given = Request(meshes=(tmp_path / "c.glb",), roles=("organ",), unit="inch", up="z")
+    assert any(note.startswith("c.glb: unit inch") for note in prepare(given).notes)
+    wrong = Request(meshes=(tmp_path / "a.stl",), roles=("organ", "ghost"))
+    assert "unknown role 'ghost'" in said(lambda: prepare(wrong))
+
+
+def test_parts_that_only_together_enclose_a_body_are_one_surface(tmp_path):
+    """Two halves of a ball as two objects of one file."""
+    whole = trimesh.creation.icosphere(subdivisions=2, radius=50.0)
+    upper = whole.triangles_center[:, 2] > 0.0
+    lines = [f"v {x} {y} {z}" for x, y, z in whole.vertices]
+    for name, faces in (("up", whole.faces[upper]), ("down", whole.faces[~upper])):
+        lines += [f"o {name}", *(f"f {a} {b} {c}" for a, b, c in faces + 1)]
+    (tmp_path / "halves.obj").write_text("\n".join(lines) + "\n")
+    found = prepare(Request(meshes=(tmp_path / "halves.obj",), roles=("organ",)))
+    assert all(mesh.is_watertight for mesh in found.meshes)
+
+
+def test_a_mirrored_node_of_a_file_keeps_its_surface_outwards(tmp_path):
+    mirrored = np.diag([-1.0, 1.0, 1.0, 1.0])
+    scene = trimesh.Scene()
+    scene.add_geometry(trimesh.creation.icosphere(radius=5.0), transform=mirrored)
+    scene.export(tmp_path / "a.glb")
+    (part,) = read_parts(tmp_path / "a.glb")
+    assert trimesh.Trimesh(part.vertices, part.faces, process=False).volume > 0.0
+
+
+def test_names_of_bodies_are_unique_and_plain(tmp_path):
+    for folder in ("x", "y", "z"):
+        (tmp_path / folder).mkdir()
+        trimesh.creation.icosphere(radius=50.0).export(tmp_path / folder / "le foie (1).stl")
+    files = tuple(tmp_path / folder / "le foie (1).stl" for folder in ("x", "y", "z"))
+    found = prepare(Request(meshes=files, roles=("organ", "keep-out", "support")))
+    assert found.names == ("le_foie__1", "le_foie__1_2", "le_foie__1_3")
+
+
+def test_paths_far_from_the_organ_have_no_patch(plane):
+    away = contour_path(plane, spec(points_mm=disc(5.0).tolist()), 0.25)
+    moved = replace(away, points_mm=away.points_mm + np.array([500.0, 0.0, 0.0]))
+    assert "the paths lie nowhere near the organ's surface" in said(
+        lambda: path_patch(plane, [moved], 0.5, 2.0)
+    )

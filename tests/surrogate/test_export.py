@@ -22,7 +22,7 @@ from surgisoft.surrogate.checkpoint import default_arm, save_model
 from surgisoft.surrogate.effects import EFFECTS, Memoryless, make_effect
 from surgisoft.surrogate.effects.base import amplitude
 from surgisoft.surrogate.export import FILES, ArmGraph, differences, export_arm
-from surgisoft.surrogate.networks import ConstantCurvature, HawNN, RecurrentArm
+from surgisoft.surrogate.networks import ConstantCurvature, HawNN, KernelArm, RecurrentArm
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = ("drift", "hysteresis", "misalignment")
@@ -164,7 +164,11 @@ def test_networks_whose_program_depends_on_their_parameters_are_graphs(tmp_path)
     curved = ConstantCurvature(low, high, model.spec.key_points)
     curved.set_rest(model.rest_mm)
     torch.nn.init.normal_(curved.table, std=0.3, generator=torch.Generator().manual_seed(2))
-    for network in (curved, RecurrentArm(low, high, model.spec.key_points, 8)):
+    kernel = KernelArm(low, high, model.spec.key_points, 4, 20, (0.1, 1.0))
+    kernel.prior.set_rest(model.rest_mm)
+    kernel.places.normal_()
+    kernel.weight.data.normal_(0, 10.0)
+    for network in (curved, kernel, RecurrentArm(low, high, model.spec.key_points, 8)):
         graph = ArmGraph(model.replace(network=network, effects={}))
         example = tuple(graph.example())
         program = torch.export.export(graph, example, strict=False).module()

@@ -19,6 +19,7 @@ from surgisoft.surrogate.interval import (
     calibrate,
     coverage_of,
     distance_to,
+    group_factor,
 )
 from surgisoft.surrogate.model import Validation
 from surgisoft.surrogate.networks import HawEnsemble
@@ -81,6 +82,35 @@ def test_calibration_rows_are_covered_and_levels_are_nested(rows, seed, missing,
     radius = found.radius_mm(distance)
     assert coverage_of(error, radius) >= LEVEL
     assert (found.radius_mm(distance, level) <= found.radius_mm(distance, level + 0.01)).all()
+
+
+def runs_of_other_sizes(runs: int, seed: int):
+    """Errors (S, 2) of runs of 200 rows, each of a size of its own (log-normal), and their runs."""
+    generator = torch.Generator().manual_seed(seed)
+    size = torch.exp(0.5 * torch.randn(runs, generator=generator, dtype=torch.float64))
+    return gaussian(200 * runs, seed + 1, size.repeat_interleave(200)), torch.arange(
+        runs
+    ).repeat_interleave(200)
+
+
+def test_few_runs_that_differ_still_cover_further_ones():
+    """The quantile of all rows of eight runs covers less than 95 % of a ninth one."""
+    covered, plain = [], []
+    for seed in range(25):
+        error, group = runs_of_other_sizes(8, 100 * seed)
+        fresh = runs_of_other_sizes(40, 100 * seed + 50)[0]
+        for found, groups in ((covered, group), (plain, torch.zeros(len(group)))):
+            interval = calibrate(error, torch.zeros(len(error)), groups, "s")
+            radius = interval.radius_mm(torch.zeros(len(fresh), dtype=torch.float64))
+            found.append(coverage_of(fresh, radius))
+    assert np.mean(plain) < 0.93
+    assert 0.935 <= np.mean(covered) <= 0.97
+
+
+def test_runs_that_are_alike_leave_the_interval_as_it_is():
+    error = gaussian(4000, 8)
+    assert group_factor(error, torch.arange(4000) // 250, LEVEL) == pytest.approx(1.0, abs=0.02)
+    assert group_factor(error, torch.zeros(4000), LEVEL) == 1.0
 
 
 def test_too_few_rows_calibrate_nothing():

@@ -15,7 +15,7 @@ from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.effects import make_effect
 from surgisoft.surrogate.history import pack
 from surgisoft.surrogate.model import ArmModel, arm_facts
-from surgisoft.surrogate.networks import ConstantCurvature, HawNN, RecurrentArm
+from surgisoft.surrogate.networks import ConstantCurvature, HawNN, KernelArm, RecurrentArm
 
 SPEC = ArmSpec(3, 5, (-15.0,) * 3, (54.0,) * 3, band=(0.2,) * 3)
 LOW, HIGH = torch.tensor(SPEC.low), torch.tensor(SPEC.high)
@@ -29,6 +29,12 @@ def model(kind: str = "haw_nn", effects: tuple[str, ...] = ("hysteresis",)) -> A
         network = HawNN(LOW, HIGH, 5, hidden=(32, 32))
     elif kind == "recurrent":
         network = RecurrentArm(LOW, HIGH, 5, width=16)
+    elif kind == "kernel":
+        network = KernelArm(LOW, HIGH, 5, 4, 20, (0.1, 1.0))
+        network.prior.set_rest(torch.tensor([[0.0, 0.0, 17.5 * k] for k in range(5)]))
+        network.prior.table.data.normal_(0, 0.2)
+        network.places.normal_()
+        network.weight.data.normal_(0, 10.0)
     else:
         network = ConstantCurvature(LOW, HIGH, 5)
         network.set_rest(torch.tensor([[0.0, 0.0, 17.5 * k] for k in range(5)]))
@@ -53,7 +59,7 @@ def walks(lengths, seed: int = 0):
     return pack(times, runs, [torch.zeros(len(run), 5, 3) for run in runs])
 
 
-@pytest.mark.parametrize("kind", ["haw_nn", "recurrent", "constant_curvature"])
+@pytest.mark.parametrize("kind", ["haw_nn", "recurrent", "kernel", "constant_curvature"])
 @given(seed=st.integers(0, 1000), lengths=st.lists(st.integers(1, 40), min_size=1, max_size=3))
 @settings(max_examples=10)
 def test_stepping_is_predicting(kind, seed, lengths):
@@ -67,7 +73,7 @@ def test_stepping_is_predicting(kind, seed, lengths):
         assert torch.allclose(points[alive], predicted[:, t][alive], atol=2e-3)
 
 
-@pytest.mark.parametrize("kind", ["haw_nn", "recurrent", "constant_curvature"])
+@pytest.mark.parametrize("kind", ["haw_nn", "recurrent", "kernel", "constant_curvature"])
 @pytest.mark.parametrize("effects", [(), ("line_lag", "hysteresis", "creep", "inertia")])
 def test_stepping_is_predicting_where_runs_begin_away_from_rest(kind, effects):
     arm, history = model(kind, effects), walks([20, 30, 25], 5)
@@ -159,7 +165,7 @@ def test_gradient_by_the_action_matches_finite_differences():
         assert torch.allclose(slope, exact[:, chamber], rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["haw_nn", "recurrent", "constant_curvature"])
+@pytest.mark.parametrize("kind", ["haw_nn", "recurrent", "kernel", "constant_curvature"])
 def test_reloaded_model_is_bit_equal(kind, tmp_path):
     arm, history = model(kind), walks([25])
     save_model(arm, tmp_path / "arm", {"note": 1})

@@ -1,6 +1,7 @@
 """Models, callables and fits that cannot be meant: one line each."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -231,7 +232,8 @@ def test_rows_of_nothing_were_never_fitted():
     assert known.share_of(some) == 1.0
     assert known.share_of(lost) == 0.0
     assert FittedRows(0, ()).share_of(some) == 0.0
-    assert known.joined(None) is known
+    assert known.joined(None) == replace(known, complete=False)
+    assert not known.joined(FittedRows(0, (), complete=False)).complete
     with pytest.raises(InputError, match="no run: expected at least one with one row"):
         pack([], [], [])
 

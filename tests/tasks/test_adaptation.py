@@ -8,9 +8,12 @@ import pytest
 import torch
 
 from surgisoft.errors import InputError
+from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.checkpoint import default_arm
+from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.networks import ConstantCurvature
 from surgisoft.surrogate.reach import steady_key_points
-from surgisoft.tasks.world.adaptation import AdaptationPrior, DisturbanceEstimator
+from surgisoft.tasks.world.adaptation import LAGS, AdaptationPrior, DisturbanceEstimator
 from surgisoft.tasks.world.arm import Randomisation
 from surgisoft.tasks.world.observer import AlphaBetaFilter
 from surgisoft.tasks.world.random_streams import streams
@@ -58,15 +61,16 @@ def test_without_transients_it_is_bayesian_linear_regression(model):
     memory, _ = learned(estimator, off, at)
     spec = model.spec
     rest, low, high = (np.array(each) for each in (spec.rest, spec.low, spec.high))
-    inputs = np.ones((40, 4))
-    inputs[:, 1:] = (at[:, 0].numpy() - rest) / np.maximum(high - rest, rest - low)
+    load = (at[:, 0].numpy() - rest) / np.maximum(high - rest, rest - low)
+    products = [load[:, a] * load[:, b] for a in range(3) for b in range(a, 3)]
+    inputs = np.column_stack((np.ones(40), load, *products))
     shapes = estimator.shapes.double().numpy()
     seen = off.double().reshape(40, 15).numpy() @ shapes
-    prior = estimator.deviation.double().numpy()[:, :4] ** 2
+    prior = estimator.deviation.double().numpy()[:, :10] ** 2
     for shape in range(15):
         precision = inputs.T @ inputs / 0.08**2 + np.diag(1.0 / prior[shape])
         expected = np.linalg.solve(precision, inputs.T @ seen[:, shape] / 0.08**2)
-        found = memory.mean[0, shape, :4].double().numpy() * np.sqrt(prior[shape])
+        found = memory.mean[0, shape, :10].double().numpy() * np.sqrt(prior[shape])
         np.testing.assert_allclose(found, expected, atol=2e-3)
 
 
@@ -217,3 +221,49 @@ def test_the_beam_of_a_simulated_arm_is_known_better_than_by_the_filter():
     filtered = beam_error_mm(AlphaBetaFilter(0.3, 0.01))
     adapted = beam_error_mm(replace(AlphaBetaFilter(), adapts=True))
     assert adapted < 0.85 * filtered
+
+
+def noisy(rows, seed):
+    """(T, 1, 5, 3) mm: white noise of `noise_mm`, as much as the prior expects."""
+    return 0.08 * torch.randn(rows, 1, 5, 3, generator=torch.Generator().manual_seed(seed))
+
+
+def test_a_disturbance_that_grows_with_the_square_of_the_loads_is_learned(model):
+    """A fifth is left of what the best linear function of the loads leaves (NumPy's lstsq)."""
+    estimator = DisturbanceEstimator(model, 0.1, replace(STILL, curve_mm=1.0))
+    at = pressures(400, 6)
+    load = ((at - estimator.rest) / estimator.reach).numpy()[:, 0]
+    shape = torch.randn(5, 3, generator=torch.Generator().manual_seed(7))
+    amount = load[:, 0] ** 2 - load[:, 1] * load[:, 2]
+    off = torch.tensor(amount, dtype=torch.float32)[:, None, None, None] * shape
+    _, found = learned(estimator, off + noisy(400, 8), at)
+    left = (found - off).flatten(1).norm(dim=1)[300:].mean() / shape.norm()
+    line = np.column_stack((np.ones(400), load))
+    linear = amount - line @ np.linalg.lstsq(line, amount, rcond=None)[0]
+    assert left < 0.2 * np.abs(linear[300:]).mean()
+
+
+def test_the_variance_of_transients_follows_the_arm(model):
+    """It falls where cameras' noise is all there is, and grows where the arm sticks and slips."""
+    estimator = DisturbanceEstimator(model, 0.1)
+    at = pressures(1, 3).expand(600, -1, -1)
+    steps = torch.randint(-1, 2, (60,), generator=torch.Generator().manual_seed(9)).float()
+    slips = 0.8 * steps.repeat_interleave(10)[:, None, None, None]
+    off = {"quiet": 0.5 * noisy(600, 10), "slips": 0.5 * noisy(600, 10) + slips}
+    unrest = {name: float(learned(estimator, each, at)[0].unrest) for name, each in off.items()}
+    assert unrest["quiet"] < 0.7
+    assert unrest["slips"] > 2.0
+
+
+def test_an_arm_with_many_chambers_has_squares_of_loads_alone():
+    """Six chambers have 21 products of two loads; the filter holds 6 of them."""
+    spec = ArmSpec(6, 3, (0.0,) * 6, (40.0,) * 6, length_mm=70.0)
+    low, high = torch.zeros(6), torch.full((6,), 40.0)
+    arm = ArmModel(spec, ConstantCurvature(low, high, key_points=3))
+    estimator = DisturbanceEstimator(arm, 0.1)
+    assert estimator.deviation.shape == (9, 1 + 6 + 6 + len(LAGS) + 1)
+    load = estimator.rest + 0.5 * estimator.reach
+    memory = estimator.start(2)
+    points = torch.zeros(2, 3, 3)
+    found = estimator.updated(memory, points + 0.1, load.expand(2, -1), points)
+    assert found.now_mm.isfinite().all()

@@ -1,6 +1,7 @@
 """Tasks, environments and worlds that are asked for what cannot be; one line each."""
 
 import dataclasses
+import zipfile
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,11 +12,13 @@ from surgisoft.errors import InputError
 from surgisoft.surrogate.checkpoint import default_arm, save_model
 from surgisoft.tasks import registry
 from surgisoft.tasks.area_ablation import AreaAblationConfig
+from surgisoft.tasks.breathing_ablation import BreathingAblationConfig, success_rule
 from surgisoft.tasks.describe import main as describe
+from surgisoft.tasks.episodes.file import load_episode
 from surgisoft.tasks.numpy_adapter import NumpyAdapter
 from surgisoft.tasks.parallel import parallel_env
 from surgisoft.tasks.path_following import FollowWeights
-from surgisoft.tasks.registry import config_of, make_task, with_present_names
+from surgisoft.tasks.registry import config_of, make_task, make_with, with_present_names
 from surgisoft.tasks.single import BatchedEnv, SingleEnv, one_agent
 from surgisoft.tasks.world.arm import Randomisation
 from surgisoft.tasks.world.observer import AlphaBetaFilter
@@ -49,6 +52,14 @@ def said(call) -> str:
         (lambda: only({"a": 1, "b": 2}, "laser"), "with the tool 'laser': a, b; expected one"),
         (lambda: describe(["--check"]), "expected one folder of pages, such as"),
         (lambda: make_task("track_hexagon"), "unknown task 'track_hexagon'"),
+        (
+            lambda: SingleEnv("circle_ablation"),
+            "task 'circle_ablation' has agents laser, endoscope, expected one; use surgisoft.para",
+        ),
+        (
+            lambda: make_with("two_laser_ring", scene="phantom_liver"),
+            "expected laser_1, laser_2, endoscope; make a scene with",
+        ),
     ],
 )
 def test_what_cannot_be_meant_is_one_line(make, message):
@@ -150,3 +161,29 @@ def test_trees_keep_their_tuples():
     found = tree_map(lambda x: x + 1, tree)
     assert isinstance(found["a"], tuple)
     assert [x.tolist() for x in found["a"]] == [[2.0, 2.0], [1.0, 1.0]]
+
+
+def test_the_rule_of_a_gated_cut_names_its_gate():
+    assert "while the organ is within 0.5 mm of the end of exhalation" in success_rule(
+        BreathingAblationConfig(mode="gated", gate_mm=0.5)
+    )
+    assert "exhalation" not in success_rule(BreathingAblationConfig(mode="follow"))
+    assert "unknown mode 'wait'" in said(lambda: BreathingAblationConfig(mode="wait"))
+
+
+def test_episodes_go_on_without_a_seed():
+    env = BatchedEnv("track_circle", num_envs=2)
+    first, _ = env.reset(seed=3)
+    following, _ = env.reset()
+    assert first.shape == following.shape
+    assert not np.array_equal(first, following)
+    env.reset(seed=3)
+    again, _ = env.reset()
+    np.testing.assert_array_equal(following, again)
+
+
+def test_an_episode_file_of_another_numpy_is_one_line(tmp_path):
+    path = tmp_path / "a.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.npy", b"\x93NUMPY\x09\x00" + b"\0" * 20)
+    assert "'a.npy' has an unknown version of .npy" in said(lambda: load_episode(path))

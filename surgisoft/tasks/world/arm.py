@@ -259,7 +259,11 @@ class ModelArm:
         """`samples` is the number K of centreline points; dt_s: time of a step of the world, s."""
         spec = mounted.model.spec
         if spec.unit != "kPa":
-            raise InputError(f"arm '{name}': its model has the unit {spec.unit}, expected kPa")
+            raise InputError(
+                f"arm '{name}': its model has the unit {spec.unit}, expected kPa; convert the "
+                "recordings by the map of 'surgisoft import' (to = 'kPa' for pressures, scale for "
+                "other quantities) and fit again"
+            )
         start = spec.rest if mounted.start_kPa is None else mounted.start_kPa
         if len(start) != spec.chambers:
             raise InputError(

@@ -34,3 +34,15 @@ def test_single_rows_are_those_of_the_whole_prediction(effect):
     assert np.abs(found(rows) - truth[rows]).max() < 1e-4
     assert np.abs(found.whole - truth).max() < 1e-4
     assert np.abs(found(rows) - truth[rows]).max() < 1e-4
+
+
+def test_the_network_computes_each_row_once():
+    model, given = default_arm(), []
+    found = sample_of(model, [measured(ROWS)], ROWS).along(Arrangement.as_recorded(3))
+    hook = model.network.register_forward_pre_hook(lambda _, inputs: given.append(len(inputs[0])))
+    first, second = found(np.array([3, 599, 250, 3])), found(np.array([250, 7, 3]))
+    found(np.array([7, 599]))
+    hook.remove()
+    assert given == [3, 1]
+    assert np.array_equal(second[[0, 2]], first[[2, 0]])
+    assert np.abs(second[1] - found.whole[7]).max() < 1e-4

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
+from surgisoft.cli.inputs import read_recordings
 from surgisoft.cli.options import EffectFiles
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
@@ -33,6 +34,14 @@ def export(
             "beside the policy itself, and print the largest difference.",
         ),
     ] = False,
+    data: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="REC...",
+            help="Recordings over which the files of an arm model are compared with the model, row "
+            "by row; the largest difference is printed, and more than 1e-5 mm refused.",
+        ),
+    ] = None,
     effect_files: EffectFiles = None,
 ) -> None:
     """Write a run's policies, or an arm model, as ONNX and TorchScript.
@@ -45,17 +54,32 @@ def export(
     is_model = str(source) == "default" or (source / "weights.safetensors").is_file()
     if is_model and (which is not None or check):
         raise InputError(f"{source}: is an arm model; --which and --check are for training runs")
-    files = _model(source, output) if is_model else _run(source, output, which or "best", check)
+    if data and not is_model:
+        raise InputError(f"{source}: is a training run; --data is for arm models, see --check")
+    if is_model:
+        files = _model(source, output, data)
+    else:
+        files = _run(source, output, which or "best", check)
     for file in files:
         print(f"wrote {file}")
 
 
-def _model(source: Path, output: Path) -> list[Path]:
+def _model(source: Path, output: Path, data: list[Path] | None) -> list[Path]:
+    from surgisoft.measurement.histories import check_fits, history_of
     from surgisoft.surrogate.checkpoint import load_model
-    from surgisoft.surrogate.export import export_arm
+    from surgisoft.surrogate.export import differences, export_arm
 
+    model, measured = load_model(source), read_recordings(data) if data else []
+    check_fits(model.spec, measured)
+    histories = {each.name: history_of([each], model.spec.actuation) for each in measured}
     with progress(f"export {source}"):
-        return export_arm(load_model(source), output)
+        files = export_arm(model, output, histories)
+    for name, found in differences(output).items():
+        print(
+            f"{name}: over {found['rows']} rows the files differ from the model by "
+            f"{found['largest_difference_mm']:.2g} mm at most"
+        )
+    return files
 
 
 def _run(source: Path, output: Path, which: str, check: bool) -> list[Path]:

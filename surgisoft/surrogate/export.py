@@ -4,15 +4,16 @@
     step(state, pressure, dt) -> state, key points
 
 in double precision, because a number of 100 mm has steps of 8e-6 mm in single precision. The files
-are compared with `ArmModel.predict` over a whole synthetic recording before they are kept.
+are compared with `ArmModel.predict` over a whole synthetic recording before they are kept, and over
+recordings that are given.
 """
 
 from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from surgisoft.errors import InputError
-from surgisoft.files import new_folder, write_json
+from surgisoft.files import new_folder, read_json, write_json
 from surgisoft.graphs import (
     Call,
     DoesNotTrace,
@@ -162,11 +163,15 @@ class _Start(nn.Module):
         return self.arm.start(pressure)
 
 
-def export_arm(model: ArmModel, folder: str | Path) -> list[Path]:
+def export_arm(
+    model: ArmModel, folder: str | Path, recordings: Mapping[str, History] | None = None
+) -> list[Path]:
     """Write an arm model for other programs; returns the files.
 
-    Raises InputError where the folder is in use, or where an effect of the model cannot be written
-    as a graph.
+    recordings: by their names; the files are also compared with the model over every row of each,
+    and `arm.json` has the largest difference of a coordinate in mm under `recordings`. Raises
+    InputError where the folder is in use, where an effect of the model cannot be written as a
+    graph, and where a difference is larger than `TOLERANCE_MM`.
     """
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -177,11 +182,17 @@ def export_arm(model: ArmModel, folder: str | Path) -> list[Path]:
             if kind_of(name) not in EFFECTS:
                 _check_effect(name, effect, graph)
         with new_folder(folder) as fresh:
-            worst = _write(graph, fresh)
-            write_json(fresh / "arm.json", describe_arm(graph, worst))
+            worst, over = _write(graph, fresh, recordings or {})
+            about = describe_arm(graph, worst)
+            write_json(fresh / "arm.json", about | ({"recordings": over} if over else {}))
     except DoesNotTrace as error:
         raise InputError(f"{folder}: the arm model cannot be exported: {error}") from error
     return [folder / name for name in FILES]
+
+
+def differences(folder: str | Path) -> dict[str, dict[str, float]]:
+    """`rows` and `largest_difference_mm` of each recording that an export was compared on."""
+    return read_json(Path(folder) / "arm.json").get("recordings", {})
 
 
 def describe_arm(graph: ArmGraph, worst_mm: float) -> dict[str, Any]:
@@ -249,8 +260,13 @@ def describe_arm(graph: ArmGraph, worst_mm: float) -> dict[str, Any]:
     }
 
 
-def _write(graph: ArmGraph, folder: Path) -> float:
-    """Write the graphs, each compared with the model; returns the largest difference, mm."""
+def _write(
+    graph: ArmGraph, folder: Path, recordings: Mapping[str, History]
+) -> tuple[float, dict[str, dict[str, float]]]:
+    """Write the graphs, each compared with the model.
+
+    Returns the largest difference in mm, and that over each recording with its rows.
+    """
     rest = graph.unpacked(graph.rest_state).pressure.clone()
     methods = {"start": (rest,), "step": tuple(graph.example())}
     script = write_torch_script_of(graph, methods, folder / "arm.pt")
@@ -264,32 +280,62 @@ def _write(graph: ArmGraph, folder: Path) -> float:
     started = write_onnx(
         _Start(graph), [rest], folder / "arm_start.onnx", ["pressure"], ["state"], batched=False
     )
-    history = _recording(graph)
-    with torch.no_grad():
-        expected = graph.model.predict(history)[0]
-    worst = 0.0
-    for start, step, name in (
+    files = (
         (script["start"], script["step"], "arm.pt"),
         (started, stepped, "arm_step.onnx"),
-    ):
-        found = _played(graph, history, start, step)
-        gap = float((found - expected).abs().max())
-        if not gap <= TOLERANCE_MM:
-            raise DoesNotTrace(
-                f"{name} differs by {gap:.2g} mm from the model; an effect or network that "
-                "branches on values cannot be exported"
-            )
-        worst = max(worst, gap)
-    return worst
+    )
+
+    def gap_of(history: History) -> float:
+        worst = 0.0
+        for run in _runs(history):
+            with torch.no_grad():
+                expected = graph.model.predict(run)[0]
+            for start, step, name in files:
+                gap = float((_played(graph, run, start, step) - expected).abs().max())
+                if not gap <= TOLERANCE_MM:
+                    raise DoesNotTrace(
+                        f"{name} differs by {gap:.2g} mm from the model; an effect or network that "
+                        "branches on values cannot be exported"
+                    )
+                worst = max(worst, gap)
+        return worst
+
+    over = {
+        name: {"rows": int(history.valid.sum()), "largest_difference_mm": gap_of(history)}
+        for name, history in recordings.items()
+    }
+    return gap_of(_recording(graph)), over
+
+
+def _runs(history: History) -> Iterator[History]:
+    """Each run by itself without padding, actuation and temperatures in double precision."""
+    warm, stood = history.temperature_C, history.stood
+    for run, count in enumerate(history.valid.sum(1).tolist()):
+        own = (slice(run, run + 1), slice(0, count))
+        yield replace(
+            history,
+            t_s=history.t_s[own],
+            pressure=history.pressure[own].double(),
+            key_points=history.key_points[own],
+            valid=history.valid[own],
+            temperature_C=None if warm is None else warm[own].double(),
+            stood=None if stood is None else stood[run : run + 1].double(),
+            predicted=None,
+        )
 
 
 def _played(graph: ArmGraph, history: History, start: Call, step: Call) -> Tensor:
     """(T, n, 3) mm: a recording of one run stepped through the functions of a file."""
-    (state,) = start(history.pressure[0, :1])
+    stood = history.stood
+    if stood is None or bool(stood.isnan().any()):
+        state = graph.rest_state
+    else:
+        (state,) = start(stood)
     dt_s, points = history.dt_s.double(), []
     warm = history.temperature_C
     for row in range(history.pressure.shape[1]):
-        warmth = [] if warm is None else [warm[:, row]] * graph.warm
+        now = torch.full((1,), torch.nan).double() if warm is None else warm[:, row]
+        warmth = [now] * graph.warm
         state, found = step(state, history.pressure[:, row], dt_s[:, row], *warmth)
         points.append(found[0])
     return torch.stack(points)

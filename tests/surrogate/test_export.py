@@ -18,10 +18,10 @@ from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.rig import VirtualRig
-from surgisoft.surrogate.checkpoint import default_arm
+from surgisoft.surrogate.checkpoint import default_arm, save_model
 from surgisoft.surrogate.effects import EFFECTS, Memoryless, make_effect
 from surgisoft.surrogate.effects.base import amplitude
-from surgisoft.surrogate.export import FILES, ArmGraph, export_arm
+from surgisoft.surrogate.export import FILES, ArmGraph, differences, export_arm
 from surgisoft.surrogate.networks import ConstantCurvature, HawNN, KernelArm, RecurrentArm
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -103,6 +103,20 @@ def test_every_effect_of_the_library_is_exported(exported, bench):
         worst = max(worst, float((points[0] - expected[row]).abs().max()))
         worst = max(worst, float(np.abs(again[0] - expected[row].numpy()).max()))
     assert worst < 1e-5
+
+
+def test_files_are_compared_over_whole_recordings(bench, tmp_path, capsys):
+    """Two runs of different length, without the padding; steps of another arm would be noticed."""
+    recording = bench[1]
+    run_of_row = (np.arange(recording.samples) >= 50).astype(recording.run.dtype)
+    save_recording(replace(recording, run=run_of_row), tmp_path / "two.csv")
+    save_model(small_arm({"hysteresis": every_effect()["hysteresis"]}), tmp_path / "small")
+    command = ["export", str(tmp_path / "small"), "--data", str(tmp_path / "two.csv")]
+    assert surgisoft([*command, "-o", str(tmp_path / "arm")]) == 0
+    assert "two: over 80 rows the files differ from the model by" in capsys.readouterr().out
+    found = differences(tmp_path / "arm")["two"]
+    assert found["rows"] == 80
+    assert 0.0 < found["largest_difference_mm"] < 1e-5
 
 
 def test_the_step_takes_any_batch_and_the_state_is_what_arm_json_says(exported):

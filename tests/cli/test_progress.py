@@ -84,9 +84,9 @@ def test_a_cell_of_a_notebook_gets_no_bar(monkeypatch):
     """IPython runs `!command` in a pseudo-terminal, whose every redrawn bar stays in the output."""
     shown = {}
     for started_by in ("shell", "notebook"):
-        monkeypatch.delenv(under_test.NOTEBOOK, raising=False)
+        monkeypatch.delenv("JPY_PARENT_PID", raising=False)
         if started_by == "notebook":
-            monkeypatch.setenv(under_test.NOTEBOOK, "1234")
+            monkeypatch.setenv("JPY_PARENT_PID", "1234")
         monkeypatch.setenv("TERM", "xterm")
         monkeypatch.setattr(sys, "stderr", Terminal())
         with progress("fit") as report:

@@ -289,14 +289,17 @@ def test_a_reference_error_that_lasts_raises_the_limit_of_sudden_ones(detector):
     assert found.sudden_limit > detector.sudden_limit
 
 
-@pytest.mark.parametrize(("here_s", "judged"), [(3.0, False), (7.0, True)])
+@pytest.mark.parametrize(("here_s", "judged"), [(3.0, (1, 15)), (7.0, (50, 90))])
 def test_motion_between_ways_outside_the_reference_is_not_judged(detector, here_s, judged):
-    """3 s of every 10 s in the reference: what a chart sums over is mostly elsewhere."""
+    """3 s of every 10 s in the reference: what a chart sums over is mostly elsewhere.
+
+    Of the 6 blocks in each of 6 rounds those at the begin count, where nothing else was before.
+    """
     t_s, values = residual(60, 16)
     actuation = waves(t_s)
     actuation[t_s % 10.0 >= here_s] += 0.7 * SPAN
     charts = Charts(detector)
     for each in zip(t_s, values, actuation, strict=True):
         charts.update(*each)
-    assert (charts.judged > 40) is judged
+    assert judged[0] <= charts.judged <= judged[1]
     assert charts.judged + charts.left_out == 118

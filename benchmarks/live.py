@@ -269,12 +269,12 @@ def run(
 def markdown(clean: Sequence[Clean], changes: Sequence[Change]) -> str:
     """The tables."""
     lines = [
-        "The threshold is set for one false alarm in 10 h (`run --false-alarm 10`); promised is "
+        "The threshold is set for one false alarm in 10 h (`run --false-alarm 10`); the goal is "
         "less than one in an hour. No robot of this page took part in setting the detector.",
         "",
         "## Clean rig",
         "",
-        "| motion | reference | hours | judged, h | false alarms | in an hour that was judged "
+        "| motion | reference | hours | judged, h | false alarms | in each judged hour "
         "| 95 % of that | highest alarm level of each robot |",
         "|---|---|---|---|---|---|---|---|",
     ]
@@ -343,7 +343,7 @@ def _over_all(changes: Sequence[Change]) -> list[str]:
     lines = [
         "## Delay, and the estimated moment of the change",
         "",
-        "Over all changes of the table above. Moment: estimated less true one, of the changes "
+        "Over all changes of the table above. Moment: estimated minus true moment, of the changes "
         "that were found without a false alarm before.",
         "",
         "| motion | reference | found | delay: median, 90 %, s | within 4 s "

@@ -424,8 +424,8 @@ def markdown(outcomes: list[Outcome]) -> str:
         "the half widths over 1.96). Where they are equal, the interval is as wide as it has to "
         "be.",
         "",
-        "| setting | quantity | RMS error | stated |",
-        "|---|---|---|---|",
+        "| setting | quantity | RMS error | stated | RMS error over stated |",
+        "|---|---|---|---|---|",
     ]
     for name, some in known.items():
         by_name: dict[str, list[Covered]] = {}
@@ -435,7 +435,8 @@ def markdown(outcomes: list[Outcome]) -> str:
         for quantity_name, found in by_name.items():
             error = math.sqrt(np.mean([(each.value - each.true) ** 2 for each in found]))
             stated = np.median([each.high - each.low for each in found]) / 2.0 / 1.96
-            lines.append(f"| {name} | `{quantity_name}` | {error:.3g} | {stated:.3g} |")
+            ratio = f"{error / stated:.2f}"
+            lines.append(f"| {name} | `{quantity_name}` | {error:.3g} | {stated:.3g} | {ratio} |")
     lines += [
         "",
         "## Falls that are claimed",

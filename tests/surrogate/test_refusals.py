@@ -289,7 +289,7 @@ def test_recordings_that_cannot_be_fitted_are_one_line(short):
 
 def test_the_record_of_a_fit_names_what_was_tried():
     arm = default_arm()
-    stage = StageReport("memory", 0.1, 5, 1.0, True, "", None, {"creep": 0.25, "none": 0.5})
+    stage = StageReport("memory", 0.1, 5, 1.0, True, tried_mm={"creep": 0.25, "none": 0.5})
     lines = FitResult(arm, [stage], [], ["be careful"], 1.0).lines()
     assert "tried for memory, held-out RMSE in mm: creep 0.250, none 0.500" in lines
     assert "note: be careful" in lines

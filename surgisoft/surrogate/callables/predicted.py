@@ -1,6 +1,7 @@
 """Predictions of a model that cannot be called, in the place of the network of an arm model."""
 
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -53,15 +54,17 @@ class PredictedNetwork(nn.Module):
 
     def forward(self, pressure: Tensor, direction: Tensor) -> Tensor:
         """Key points (..., n, 3) in mm, base frame, by the polynomial of pressure (..., m)."""
-        x = (pressure.double() - self.centre) / self.half_range
-        terms = torch.stack(
-            [
-                torch.stack([x[..., j] ** int(e) for j, e in enumerate(powers)], -1).prod(-1)
-                for powers in self.exponents.tolist()
-            ],
-            -1,
-        )
+        terms = self._terms(pressure, self.exponents)
         return torch.einsum("...f,fnj->...nj", terms, self.coefficients).to(pressure.dtype)
+
+    def _terms(self, pressure: Tensor, exponents: Tensor) -> Tensor:
+        """(..., F) monomials of the scaled actuation, from pressure (..., m), exponents (F, m)."""
+        x = (pressure.double() - self.centre) / self.half_range
+        terms = [
+            torch.stack([x[..., j] ** int(e) for j, e in enumerate(powers)], -1).prod(-1)
+            for powers in exponents.tolist()
+        ]
+        return torch.stack(terms, -1)
 
     def along(self, actuation: Tensor, history: History, memory: Tensor | None) -> Tensor:
         """Key points (R, T, n, 3) in mm along effective actuation (R, T, m) of a history's runs."""
@@ -70,6 +73,27 @@ class PredictedNetwork(nn.Module):
             return points
         known = history.pressure.to(actuation)
         return history.predicted.to(points) + points - self(known, known)
+
+    def slope_along(
+        self,
+        actuation: Tensor,
+        history: History,
+        memory: Tensor | None,
+        rows: Callable[[Tensor], Tensor],
+    ) -> Tensor:
+        """(S, n, 3, m) derivative of the key points by the row's own actuation, mm a unit.
+
+        It is that of the polynomial: predictions that are known do not depend on the actuation of
+        an effect. rows: picks the rows (S, ...) of a (R, T, ...) tensor.
+        """
+        pressure, slopes = rows(actuation), []
+        for chamber in range(pressure.shape[-1]):
+            lower = self.exponents.clone()
+            lower[:, chamber] = (lower[:, chamber] - 1).clamp(min=0)
+            scale = self.exponents[:, chamber] / self.half_range[chamber]
+            terms = self._terms(pressure, lower) * scale
+            slopes.append(torch.einsum("sf,fnj->snj", terms, self.coefficients))
+        return torch.stack(slopes, -1).to(pressure.dtype)
 
 
 def powers(chambers: int, degree: int) -> np.ndarray:

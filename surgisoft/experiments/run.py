@@ -213,11 +213,12 @@ def read_rows(folder: Path, every: list[Job]) -> list[Row]:
 
 
 def _is_whole(row: Row) -> bool:
-    """Whether a row has what every row has, with success, collision and failure as 0 or 1."""
+    """Whether a row has what every row has, texts and numbers, with rates as 0 or 1."""
     rates = [row.get(name, 0) for name in RATES]
     texts = [row.get(name) for name in ("case", "outcome")]
     return (
         "success" in row
+        and object not in _kinds(row).values()
         and all(type(rate) in (int, float) and rate in (0, 1) for rate in rates)
         and all(isinstance(text, str) for text in texts)
     )

@@ -14,7 +14,7 @@ from surgisoft.errors import InputError
 from surgisoft.experiments.controllers import PhaseControllers, Schedule
 from surgisoft.experiments.phases import PhasedTask, with_phase_events
 from surgisoft.experiments.plan import build_task, rig_config, scene_of, settings
-from surgisoft.experiments.run import open_results
+from surgisoft.experiments.run import jobs, open_results, read_rows, row_file
 from surgisoft.experiments.session import (
     experiments_of,
     start_experiment,
@@ -190,3 +190,24 @@ def test_results_go_on_only_with_their_own_scene(tmp_path):
         open_results(spec, folder, resume=True)
     with pytest.raises(InputError, match="exists and holds no results of an experiment"):
         open_results(spec, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "value", [{}, [1.0], True, 10**400], ids=["a table", "a list", "a truth value", "too large"]
+)
+def test_rows_hold_texts_and_numbers(tmp_path, value):
+    """Also where all rows have the same kind of value in a field."""
+    spec = spec_of(tmp_path)
+    every = jobs(spec)
+    row = {"case": "a", "outcome": "done", "success": 0.0, "time_s": 1.0}
+    for job in every:
+        for episode in range(job.first, job.first + job.count):
+            file = row_file(tmp_path, job.setting, episode)
+            about = {"setting": job.setting.label, "episode": episode}
+            file.parent.mkdir(exist_ok=True)
+            file.write_text(json.dumps(row | about))
+    assert len(read_rows(tmp_path, every)) == sum(job.count for job in every)
+    for file in (tmp_path / "rows").glob("*.json"):
+        file.write_text(json.dumps(json.loads(file.read_text()) | {"time_s": value}))
+    with pytest.raises(InputError, match="is not the row of episode 0"):
+        read_rows(tmp_path, every)

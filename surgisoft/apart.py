@@ -1,8 +1,8 @@
 """Reading of a file in a process of its own, by a library that may end the process it is in.
 
-rerun-sdk 0.41 aborts on several kinds of damage, ezc3d 1.7 and SciPy 1.17's `loadmat` on some bytes
-end in a segmentation fault, and a length that a file claims decides how much they allocate. A child
-process with limits calls the library; its end is an error of one line here.
+rerun-sdk 0.41 aborts on several kinds of damage. ezc3d 1.7, SciPy 1.17's `loadmat` and HDF5 (h5py
+3.16) end in a segmentation fault on some bytes, and a length that a file claims decides how much
+they allocate. A child process with limits calls the library; its end is an error of one line here.
 """
 
 from __future__ import annotations

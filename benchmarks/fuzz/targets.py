@@ -898,7 +898,7 @@ TARGETS: dict[str, Target] = {
     "import": Target(make_raw, read_raw, weight=3, inputs=10_000),
     "c3d": Target(make_c3d, read_raw, ("*.c3d",), imports=("ezc3d",)),
     "matlab": Target(make_matlab, read_raw, ("*.mat",), imports=("scipy.io",)),
-    "hdf5": Target(make_hdf5, read_raw, ("*.h5", "*.mat"), inputs=10_000),
+    "hdf5": Target(make_hdf5, read_raw, ("*.h5", "*.mat"), imports=("h5py",)),
     "mcap": Target(make_mcap, read_raw, ("*.mcap",), inputs=10_000),
     "model": Target(
         make_models, read_model, ("config.json", "*.safetensors"), weight=2, inputs=30_000

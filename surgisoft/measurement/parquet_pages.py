@@ -3,13 +3,16 @@
 A column of a row group (a column chunk) is a row of pages, each behind a header in Thrift's compact
 protocol that states the page's size, packed and unpacked, and its number of values. pyarrow takes
 memory for these numbers before it reads the page: a damaged header of a small file makes it ask for
-gigabytes. The headers are read here first (Apache Parquet format 2.11, `PageHeader`).
+gigabytes. The headers are read here first (Apache Parquet format 2.11, `PageHeader`), and so are
+the places of the column chunks in the file's footer (`FileMetaData`): pyarrow 26 aborts the process
+where it is asked for the place of a column chunk with damaged statistics of sizes.
 """
 
 from __future__ import annotations
 
 import mmap
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import pyarrow as pa
@@ -29,6 +32,13 @@ OLD_MARGIN = 100
 """Bytes by which old writers state a column chunk too short (Arrow's issue PARQUET-816)."""
 DEEPEST = 16
 """Most levels of structures in a header; a page's has three."""
+FOOTER_END = 8
+"""Bytes behind the footer: its length, and the letters `PAR1`."""
+STRUCTURE = 12
+"""Type of a structure in Thrift's compact protocol; that of a list is 9."""
+ROW_GROUPS, COLUMNS = (4, 9), (1, 9)
+"""Number and type of the field of `FileMetaData` that lists row groups, and of the field of
+`RowGroup` that lists column chunks."""
 
 
 def open_metadata(path: Path) -> pq.FileMetaData:
@@ -43,7 +53,7 @@ def open_metadata(path: Path) -> pq.FileMetaData:
         check_claim(path, 8 * rows * columns, f"{rows} rows of {columns} columns")
         if rows:
             with path.open("rb") as file, mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ) as data:
-                _check(path, content, data)
+                _check(path, data)
     except InputError:
         raise
     except (pa.ArrowException, OSError, ValueError) as error:
@@ -60,28 +70,66 @@ def check_claim(path: Path, claimed: int, what: str) -> None:
         )
 
 
-def _check(path: Path, content: pq.FileMetaData, data: mmap.mmap) -> None:
+def _check(path: Path, data: mmap.mmap) -> None:
     """Raise InputError or ValueError where the pages claim too much or lie outside of the file."""
     unpacked = values = 0
-    for group in range(content.num_row_groups):
-        for column in range(content.num_columns):
-            chunk = content.row_group(group).column(column)
-            values += max(chunk.num_values, 0)
-            check_claim(path, 8 * values, f"{values} values")
-            for size in _page_sizes(chunk, data):
-                unpacked += size
-                check_claim(path, unpacked, f"pages of {unpacked} bytes")
+    for chunk in _chunks(data):
+        values += max(chunk.values, 0)
+        check_claim(path, 8 * values, f"{values} values")
+        for size in _page_sizes(chunk, data):
+            unpacked += size
+            check_claim(path, unpacked, f"pages of {unpacked} bytes")
 
 
-def _page_sizes(chunk: pq.ColumnChunkMetaData, data: mmap.mmap) -> Iterator[int]:
+@dataclass(frozen=True)
+class _Chunk:
+    """Where a column chunk is in the file, as the footer states it."""
+
+    values: int
+    """Number of values."""
+    begin: int
+    """Its first page, bytes from the begin of the file."""
+    end: int
+    """Its end, bytes from the begin of the file."""
+
+
+def _chunks(data: mmap.mmap) -> Iterator[_Chunk]:
+    """The column chunks of all row groups, from the footer."""
+    end = len(data) - FOOTER_END
+    begin = end - int.from_bytes(data[end : end + 4], "little")
+    if begin < 0:
+        raise ValueError("a footer longer than the file")
+    footer = _Thrift(data, begin, end)
+    for number, kind in footer.heads():
+        if (number, kind) != ROW_GROUPS:
+            footer.value(kind, alone=True)
+            continue
+        for _ in footer.structures():
+            for inner, of in footer.heads():
+                if (inner, of) != COLUMNS:
+                    footer.value(of, alone=True)
+                    continue
+                for _ in footer.structures():
+                    yield _chunk(footer.structure().get(3))
+
+
+def _chunk(about: int | dict | None) -> _Chunk:
+    """A column chunk from the fields of its `ColumnMetaData`."""
+    fields = about if isinstance(about, dict) else {}
+    values, size, begin, dictionary = (fields.get(number) for number in (5, 7, 9, 11))
+    if not (isinstance(values, int) and isinstance(size, int) and isinstance(begin, int)):
+        raise ValueError("a column chunk without its place")
+    if isinstance(dictionary, int) and 0 < dictionary < begin:
+        begin = dictionary
+    return _Chunk(values, begin, begin + size)
+
+
+def _page_sizes(chunk: _Chunk, data: mmap.mmap) -> Iterator[int]:
     """Unpacked size of each page of a column chunk, bytes."""
-    at = chunk.data_page_offset
-    if chunk.has_dictionary_page and 0 < chunk.dictionary_page_offset < at:
-        at = chunk.dictionary_page_offset
-    end = at + chunk.total_compressed_size
+    at, end = chunk.begin, chunk.end
     if not 0 < at <= end <= len(data):
         raise ValueError("a column chunk outside of the file")
-    end, left = min(end + OLD_MARGIN, len(data)), chunk.num_values
+    end, left = min(end + OLD_MARGIN, len(data)), chunk.values
     while left > 0 and at < end:
         header = _Thrift(data, at)
         fields = header.structure()
@@ -107,21 +155,38 @@ def _page_sizes(chunk: pq.ColumnChunkMetaData, data: mmap.mmap) -> Iterator[int]
 class _Thrift:
     """Reads integers and structures of Thrift's compact protocol, and passes over the rest."""
 
-    def __init__(self, data: mmap.mmap, at: int):
-        self.data, self.at, self.end = data, at, min(len(data), at + LONGEST_HEADER)
+    def __init__(self, data: mmap.mmap, at: int, end: int | None = None):
+        """Read from byte `at` to `end` (default: the longest header, or the end of the file)."""
+        self.data, self.at = data, at
+        self.end = min(len(data), at + LONGEST_HEADER) if end is None else end
 
     def structure(self, depth: int = 0) -> dict[int, int | dict | None]:
         """Fields by their number: integers, structures, and None for what is passed over."""
         if depth > DEEPEST:
             raise ValueError("structures nested too deeply")
-        fields: dict[int, int | dict | None] = {}
+        return {number: self.value(kind, depth, alone=True) for number, kind in self.heads()}
+
+    def heads(self) -> Iterator[tuple[int, int]]:
+        """Number and type of each field of a structure; the caller reads its value."""
         number = 0
         while (head := self._byte()) != 0:
             number = number + (head >> 4) if head >> 4 else self._integer()
-            fields[number] = self._value(head & 15, depth, alone=True)
-        return fields
+            yield number, head & 15
 
-    def _value(self, kind: int, depth: int, alone: bool = False) -> int | dict | None:
+    def elements(self) -> Iterator[int]:
+        """Type of each element of a list; the caller reads its value."""
+        head = self._byte()
+        for _ in range(head >> 4 if head >> 4 != 15 else self._unsigned()):
+            yield head & 15
+
+    def structures(self) -> Iterator[None]:
+        """Once for each element of a list of structures; the caller reads its fields."""
+        for kind in self.elements():
+            if kind != STRUCTURE:
+                raise ValueError("a list of something else than structures")
+            yield
+
+    def value(self, kind: int, depth: int = 0, alone: bool = False) -> int | dict | None:
         match kind:
             case 1 | 2:  # a field's truth value is its type; an element's is a byte
                 self._skip(0 if alone else 1)
@@ -134,9 +199,10 @@ class _Thrift:
             case 8:
                 self._skip(self._unsigned())
             case 9 | 10:
-                head = self._byte()
-                for _ in range(head >> 4 if head >> 4 != 15 else self._unsigned()):
-                    self._value(head & 15, depth + 1)
+                if depth > DEEPEST:
+                    raise ValueError("lists nested too deeply")
+                for inner in self.elements():
+                    self.value(inner, depth + 1)
             case 12:
                 return self.structure(depth + 1)
             case _:

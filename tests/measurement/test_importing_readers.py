@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from benchmarks.fuzz.targets import make_c3d, make_matlab
+from surgisoft import apart
 from surgisoft.cli import run
 from surgisoft.errors import InputError
 from surgisoft.measurement.importing import READERS, RawTable, Reader, import_files, load_map
@@ -216,6 +217,25 @@ def test_groups_of_an_hdf5_file_and_of_matlab_7_3(tmp_path, name):
         group["k"] = k
         file["image"] = np.zeros((40, 30))
     check_struct(tmp_path / name, tmp_path)
+
+
+@pytest.mark.parametrize("block", [0, 512])
+def test_a_process_of_its_own_reads_hdf5(tmp_path, monkeypatch, block):
+    """HDF5 writes beyond its memory on some damaged files, which ends the process it is in."""
+    h5py = pytest.importorskip("h5py", reason="the extra 'lab' is not installed")
+    with h5py.File(tmp_path / "raw.mat", "w", userblock_size=block) as file:
+        file["log"] = table()
+    started = []
+
+    def ended(module, path):
+        started.append((module, path))
+        return apart.Ended(-11, b"", b"")
+
+    monkeypatch.setattr(apart, "started", ended)
+    (tmp_path / "map.toml").write_text(MAP.replace('format = "FORMAT"', 'topic = "log"'))
+    with pytest.raises(InputError, match=r"cannot be read as an HDF5 file .*status -11"):
+        import_files([tmp_path / "raw.mat"], load_map(str(tmp_path / "map.toml")), "r")
+    assert started == [("surgisoft.measurement.importing.readers.arrays", tmp_path / "raw.mat")]
 
 
 def test_a_compound_dataset_has_a_column_for_each_field(tmp_path):

@@ -257,6 +257,18 @@ def test_the_pages_of_a_parquet_file_cannot_claim_gigabytes(tmp_path, monkeypatc
     assert f"claims pages of {2 * (2**20 - 1)} bytes" in error_of(path)
 
 
+def test_damaged_statistics_of_sizes_do_not_end_the_process(tmp_path):
+    """pyarrow 26 aborts where it is asked for the place of a column chunk of such a file."""
+    path, names = tmp_path / "bad.parquet", HEAD.split(",")
+    table = pa.table([[1.0, None, 2.0]] * len(names), names=names)
+    pq.write_table(table, path)
+    levels, fewer = b"\x26\x02\x04", b"\x16\x82\x04"  # lists of 1 and 2, and of 257 alone
+    content = path.read_bytes()
+    assert content.count(levels) == len(names)
+    path.write_bytes(content.replace(levels, fewer))
+    assert "not a readable Parquet file" in error_of(path)
+
+
 def test_a_list_in_the_header_of_a_page_ends_with_the_file(tmp_path):
     """A header may claim a list of 2**42 truth values, which take no time to pass over."""
     path, names = tmp_path / "bad.parquet", HEAD.split(",")

@@ -9,6 +9,7 @@ time; arrays of which no axis is as long are left out, and said so. `topic` in t
 MATLAB files of version 7.3 are HDF5; older ones are read by SciPy.
 """
 
+import importlib.util
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -49,21 +50,31 @@ class Arrays:
 
 
 def _read_hdf5(path: Path, role: FileRole) -> RawTable:
-    return _table(path, role, dict(_hdf5(path)))
+    if importlib.util.find_spec("h5py") is None:
+        raise InputError(
+            f"{path}: an HDF5 file needs the package h5py, which is not installed: "
+            "pip install 'surgisoft[lab]'"
+        )
+    return _apart(path, role, "an HDF5 file")
 
 
 def _read_matlab(path: Path, role: FileRole) -> RawTable:
-    with path.open("rb") as file:
-        head = file.read(USER_BLOCK + len(HDF5_MAGIC))
-    if HDF5_MAGIC in (head[: len(HDF5_MAGIC)], head[USER_BLOCK:]):
-        return _read_hdf5(path, role)
-    names, found = unpacked(read_apart(__name__, path, "a MATLAB file"))
+    return _read_hdf5(path, role) if _is_hdf5(path) else _apart(path, role, "a MATLAB file")
+
+
+def _apart(path: Path, role: FileRole, what: str) -> RawTable:
+    names, found = unpacked(read_apart(__name__, path, what))
     return _table(path, role, dict(zip(names, found, strict=True)))
 
 
 def as_bytes(path: Path) -> bytes:
-    """Paths and arrays of a MATLAB file before version 7.3; SciPy may end the process on a bad
-    one."""
+    """Paths and arrays of a file; SciPy and HDF5 may end the process on a damaged one."""
+    found = dict(_hdf5(path) if _is_hdf5(path) else _matlab(path))
+    return packed(list(found), *found.values())
+
+
+def _matlab(path: Path) -> Iterator[tuple[str, np.ndarray]]:
+    """(path, array) of every array of numbers of a MATLAB file before version 7.3."""
     from scipy.io import loadmat
 
     try:
@@ -73,19 +84,13 @@ def as_bytes(path: Path) -> bytes:
             f"{path}: cannot be read as a MATLAB file ({type(error).__name__}: {error})"
         ) from None
     fields = {name: value for name, value in content.items() if not name.startswith("__")}
-    found = dict(_inside(fields, ""))
-    return packed(list(found), *found.values())
+    yield from _inside(fields, "")
 
 
 def _hdf5(path: Path) -> Iterator[tuple[str, np.ndarray]]:
     """(path, array) of every numeric dataset of a file."""
-    try:
-        import h5py
-    except ImportError:
-        raise InputError(
-            f"{path}: an HDF5 file needs the package h5py, which is not installed: "
-            "pip install 'surgisoft[lab]'"
-        ) from None
+    import h5py
+
     found: list[tuple[str, np.ndarray]] = []
     left = max(MOST_UNPACKED, MOST_PACKED * path.stat().st_size)
 
@@ -157,8 +162,10 @@ def _table(path: Path, role: FileRole, arrays: dict[str, np.ndarray]) -> RawTabl
 
 
 def _is_hdf5(path: Path) -> bool:
+    """Whether a file is HDF5, with the user block of MATLAB 7.3 or without."""
     with path.open("rb") as file:
-        return file.read(len(HDF5_MAGIC)) == HDF5_MAGIC
+        head = file.read(USER_BLOCK + len(HDF5_MAGIC))
+    return HDF5_MAGIC in (head[: len(HDF5_MAGIC)], head[USER_BLOCK:])
 
 
 HDF5 = Reader("an HDF5 file", _read_hdf5, suffixes=(".h5", ".hdf5"), fits=_is_hdf5)

@@ -76,8 +76,8 @@ AS_GOOD = 1.64
 """Studentised log gain of two effects over another pair below which the other does as well (5 %,
 one-sided)."""
 VARIES = 0.04
-"""Variance of an amplitude between motions, in units of its square, from which a check mentions it:
-a fifth of the amplitude. Stated."""
+"""Least variance of an amplitude between motions, in units of its square, that a check mentions: a
+standard deviation of a fifth of the amplitude. Chosen before any case was looked at."""
 FITTED_STAGES = ("line", "material")
 """Stages of effects that a network can be fitted together with."""
 MOST_FITTED = 3

@@ -162,8 +162,8 @@ def test_sensitivities_are_finite_differences_of_the_prediction(name, away):
     assert place == len(found)
 
 
-def test_the_networks_slope_is_that_of_reverse_differentiation():
-    """Forward against reverse differentiation, for every static network."""
+def test_the_networks_slope_is_the_jacobian_of_each_row():
+    """Against `torch.autograd.functional.jacobian` of one row at a time, for static networks."""
     arm = model(())
     curved = ConstantCurvature(*(torch.tensor(x) for x in (arm.spec.low, arm.spec.high)), 5)
     curved.set_rest(arm.rest_mm)

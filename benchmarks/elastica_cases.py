@@ -27,6 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.diagnosis.cases import PAIRS
 from surgisoft.files import write_atomically
 from surgisoft.measurement.protocols import Protocol
 from surgisoft.measurement.protocols.continuous import schedule
@@ -54,17 +55,6 @@ KNOWN = {
 """Hidden effect of the rig -> the name that a diagnosis should give."""
 UNKNOWN = ("breathing", "stick_slip", "leak", "knock")
 """Hidden effects for which a diagnosis has no name."""
-PAIRS = (
-    ("creep", "payload"),
-    ("line_lag", "misalignment"),
-    ("hysteresis", "creep"),
-    ("softening", "gain_mismatch"),
-    ("drift", "dead_zone"),
-    ("rate_dependence", "payload"),
-    ("line_lag", "creep"),
-    ("misalignment", "gain_mismatch"),
-)
-"""Pairs that are hidden at once."""
 CLEAN_A_ROUND, PAIRS_A_ROUND = 4, 2
 """Cases without any change, and with two effects, in a round."""
 CHANGE_MM = (0.4, 3.0)

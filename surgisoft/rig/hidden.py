@@ -5,8 +5,9 @@ protocol); benchmarks/collect.py measures it. Signs and places vary with the rob
 """
 
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 from scipy.optimize import brentq
@@ -36,16 +37,53 @@ class Setup:
     """Window of time in which events that occur once fall [s]."""
 
 
+AnySetup = TypeVar("AnySetup")
+"""Type of what the hidden effects of a rig change."""
+
+
 @dataclass(frozen=True)
-class Hidden:
-    """One hidden effect."""
+class Hidden(Generic[AnySetup]):
+    """One hidden effect of a rig."""
 
     place: str
     """Where in the chain it acts: line, material, body or sensor."""
     about: str
     """Description in one line."""
-    switch_on: Callable[[Setup, float, np.random.Generator], None]
+    switch_on: Callable[[AnySetup, float, np.random.Generator], None]
     """Switches the effect on: (setup, amplitude, random numbers of the robot's seed)."""
+
+
+def switch_on_from(
+    known: Mapping[str, Hidden[AnySetup]],
+    setup: AnySetup,
+    names: Iterable[tuple[str, float]],
+    seed: int,
+    *stream: int,
+) -> AnySetup:
+    """Apply the named effects of a rig's list to the setup, each with its amplitude (0: off).
+
+    seed, stream: the robot's seed, and numbers that tell its draws from those of other rigs.
+    Raises InputError for a name that is unknown or given twice, and for a strength beyond 0 to 10.
+    """
+    seen: set[str] = set()
+    for name, strength in names:
+        if name not in known:
+            raise unknown_name("hidden effect", name, known)
+        if name in seen:
+            raise InputError(f"hidden effect '{name}' is given twice, expected once")
+        if not (np.isfinite(strength) and 0.0 <= strength <= 10.0):
+            raise InputError(f"strength of '{name}' is {strength}, expected 0 to 10")
+        seen.add(name)
+        if strength > 0:
+            rng = np.random.default_rng([seed, zlib.crc32(name.encode()), *stream])
+            known[name].switch_on(setup, float(strength), rng)
+    return setup
+
+
+def random_direction(rng: np.random.Generator) -> np.ndarray:
+    """(3,) random unit vector."""
+    v = rng.normal(size=3)
+    return v / np.linalg.norm(v)
 
 
 def _set(setup: Setup, **amplitudes) -> None:
@@ -57,12 +95,6 @@ def _pattern(rng: np.random.Generator, m: int) -> np.ndarray:
     values = rng.permutation(np.linspace(-1.0, 1.0, m)) + rng.normal(0.0, 0.2, m)
     values -= values.mean() if m > 1 else 0.0
     return values / np.sqrt(np.mean(values**2))
-
-
-def _direction(rng: np.random.Generator) -> np.ndarray:
-    """(3,) random unit vector."""
-    v = rng.normal(size=3)
-    return v / np.linalg.norm(v)
 
 
 def _hysteresis(setup: Setup, strength: float, rng: np.random.Generator) -> None:
@@ -150,8 +182,8 @@ def _posed(setup: Setup, loads: Loads, pressures: np.ndarray) -> np.ndarray:
 
 
 def _misalignment(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    turn = np.radians(0.8) * strength * _direction(rng)
-    shift = 0.4 * strength * _direction(rng)
+    turn = np.radians(0.8) * strength * random_direction(rng)
+    shift = 0.4 * strength * random_direction(rng)
     warp = 1e-4 * strength * rng.choice([-1.0, 1.0])
     _set(setup, misalignment=np.concatenate([turn, shift, [warp]]))
 
@@ -192,7 +224,7 @@ def _marker_slip(setup: Setup, strength: float, rng: np.random.Generator) -> Non
 
 def _breathing(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     """About 15 breaths a minute."""
-    shift = 2.0 * strength * _direction(rng)
+    shift = 2.0 * strength * random_direction(rng)
     period = rng.uniform(3.5, 4.5)
     _set(setup, breath=np.array([*shift, period, rng.uniform(0.0, period)]))
 
@@ -219,7 +251,7 @@ def _fibre_break(setup: Setup, strength: float, rng: np.random.Generator) -> Non
     _set(setup, broken=broken, break_s=float(rng.uniform(*setup.event_window_s)))
 
 
-HIDDEN: dict[str, Hidden] = {
+HIDDEN: dict[str, Hidden[Setup]] = {
     "hysteresis": Hidden("material", "more friction of the fibres (Preisach)", _hysteresis),
     "rate_dependence": Hidden(
         "material", "viscous wall, force with the root of strain rate", _rate_dependence
@@ -261,17 +293,5 @@ HIDDEN: dict[str, Hidden] = {
 
 
 def switch_on(setup: Setup, names: Iterable[tuple[str, float]], seed: int) -> Setup:
-    """Apply the named effects to the setup, each with its amplitude (0: off)."""
-    seen: set[str] = set()
-    for name, strength in names:
-        if name not in HIDDEN:
-            raise unknown_name("hidden effect", name, HIDDEN)
-        if name in seen:
-            raise InputError(f"hidden effect '{name}' is given twice, expected once")
-        if not (np.isfinite(strength) and 0.0 <= strength <= 10.0):
-            raise InputError(f"strength of '{name}' is {strength}, expected 0 to 10")
-        seen.add(name)
-        if strength > 0:
-            rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
-            HIDDEN[name].switch_on(setup, float(strength), rng)
-    return setup
+    """`switch_on_from` the hidden effects of the virtual rig."""
+    return switch_on_from(HIDDEN, setup, names, seed)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Protocol, TypeGuard
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import ArmInfo
@@ -141,3 +142,26 @@ def checked_command(pressures: np.ndarray, limits: np.ndarray, unit: str) -> np.
             f"{low.min():g} to {high.max():g} {unit}"
         )
     return pressures
+
+
+def check_simulated(
+    seed: int, gravity: ArrayLike | None, payload_g: float, most_g: float, noise: float
+) -> None:
+    """Raise an InputError for a robot, mounting or noise that no simulated rig can have.
+
+    seed: of the robot; gravity: (3,) direction of weight of any length but zero, None where the
+    robot's seed draws it; payload_g, most_g: mass at the tip and the largest that is accepted [g];
+    noise: factor on all noise.
+    """
+    if seed < 0:
+        raise InputError(f"seed is {seed}, expected a whole number >= 0")
+    if gravity is not None:
+        direction = np.asarray(gravity, np.float64)
+        if direction.shape != (3,) or not np.isfinite(direction).all() or not direction.any():
+            raise InputError(
+                f"gravity is {direction.tolist()}, expected a direction of three numbers"
+            )
+    if not 0.0 <= payload_g <= most_g:
+        raise InputError(f"payload is {payload_g} g, expected 0 to {most_g:g} g")
+    if not (np.isfinite(noise) and noise >= 0.0):
+        raise InputError(f"noise scale is {noise}, expected a number >= 0")

@@ -34,7 +34,7 @@ from surgisoft.rig.collect import (
 )
 from surgisoft.rig.effects import no_effects
 from surgisoft.rig.hidden import EVENT_WINDOW_S, Setup, switch_on
-from surgisoft.rig.interface import Sample, Truth, checked_command
+from surgisoft.rig.interface import Sample, Truth, check_simulated, checked_command
 from surgisoft.rig.motion_capture import CameraDesign, build_cameras
 from surgisoft.rig.pneumatics import PumpDesign, build_pumps
 
@@ -84,17 +84,7 @@ class VirtualRigConfig:
         late = [tuple(effect) for effect in self.later] + [e for e in given if len(e) == 3]
         object.__setattr__(self, "hidden", tuple(e for e in given if len(e) == 2))
         object.__setattr__(self, "later", tuple(sorted(late, key=lambda effect: effect[2])))
-        direction = np.asarray(self.gravity, np.float64)
-        if self.seed < 0:
-            raise InputError(f"seed is {self.seed}, expected a whole number >= 0")
-        if direction.shape != (3,) or not np.isfinite(direction).all() or not direction.any():
-            raise InputError(
-                f"gravity is {direction.tolist()}, expected a direction of three numbers"
-            )
-        if not 0.0 <= self.payload_g <= HEAVIEST_G:
-            raise InputError(f"payload is {self.payload_g} g, expected 0 to {HEAVIEST_G:g} g")
-        if not (np.isfinite(self.noise) and self.noise >= 0.0):
-            raise InputError(f"noise scale is {self.noise}, expected a number >= 0")
+        check_simulated(self.seed, self.gravity, self.payload_g, HEAVIEST_G, self.noise)
         for name, _, begins_s in self.later:
             if not 0.0 <= begins_s < math.inf:
                 raise InputError(

@@ -11,16 +11,17 @@ and clamp rather than on pressures or key points.
 """
 
 import math
-import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
-from surgisoft.errors import InputError, unknown_name
 from surgisoft.rig.elastica.plant import Plant, advance, new_state, rest
 from surgisoft.rig.elastica.rod import Body
-from surgisoft.rig.hidden import EVENT_WINDOW_S
+from surgisoft.rig.hidden import EVENT_WINDOW_S, Hidden, random_direction, switch_on_from
+
+STREAM = 0xE1A
+"""Number that tells this rig's draws from those of the virtual rig with the same seed."""
 
 
 @dataclass
@@ -33,18 +34,6 @@ class Setup:
     """The rod as cast; its masses may change."""
     event_window_s: tuple[float, float] = EVENT_WINDOW_S
     """Window of time in which events that occur once fall [s]."""
-
-
-@dataclass(frozen=True)
-class Hidden:
-    """One hidden effect of the PyElastica rig."""
-
-    place: str
-    """Where in the chain it acts: line, material, body or sensor."""
-    about: str
-    """Description in one line."""
-    switch_on: Callable[[Setup, float, np.random.Generator], None]
-    """Switches the effect on: (setup, amplitude, random numbers of the robot's seed)."""
 
 
 def _set(setup: Setup, **values) -> None:
@@ -63,12 +52,6 @@ def _sideways(rng: np.random.Generator) -> np.ndarray:
     """(3,) random unit vector across the arm."""
     angle = rng.uniform(0, 2 * np.pi)
     return np.array([math.cos(angle), math.sin(angle), 0.0])
-
-
-def _direction(rng: np.random.Generator) -> np.ndarray:
-    """(3,) random unit vector."""
-    v = rng.normal(size=3)
-    return v / np.linalg.norm(v)
 
 
 def _length(setup: Setup) -> float:
@@ -140,8 +123,8 @@ def _payload(setup: Setup, strength: float, rng: np.random.Generator) -> None:
 
 
 def _misalignment(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    turn = 0.04 * strength / (_length(setup) / 0.02) * _direction(rng)
-    _set(setup, misalignment=np.concatenate([turn * 2.0, 0.4 * strength * _direction(rng)]))
+    turn = 0.04 * strength / (_length(setup) / 0.02) * random_direction(rng)
+    _set(setup, misalignment=np.concatenate([turn * 2.0, 0.4 * strength * random_direction(rng)]))
 
 
 def _drift(setup: Setup, strength: float, rng: np.random.Generator) -> None:
@@ -196,7 +179,7 @@ def _shape(setup: Setup, pressures: np.ndarray) -> np.ndarray:
 
 def _breathing(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     period = rng.uniform(3.2, 5.0)
-    shift = 2e-3 * strength * _direction(rng)
+    shift = 2e-3 * strength * random_direction(rng)
     _set(setup, breath=np.array([*shift, period, rng.uniform(0.0, period)]))
 
 
@@ -216,7 +199,7 @@ def _leak(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     _set_gas(setup, leak=leak)
 
 
-HIDDEN: dict[str, Hidden] = {
+HIDDEN: dict[str, Hidden[Setup]] = {
     "hysteresis": Hidden("material", "more elastoplastic friction in the wall", _hysteresis),
     "rate_dependence": Hidden("material", "an Eyring fluid in the wall", _rate_dependence),
     "line_lag": Hidden("line", "narrow tubes behind the sensors, ISO 6358 flow", _line_lag),
@@ -241,17 +224,5 @@ HIDDEN: dict[str, Hidden] = {
 
 
 def switch_on(setup: Setup, names: Iterable[tuple[str, float]], seed: int) -> Setup:
-    """Apply the named effects to the setup, each with its amplitude (0: off)."""
-    seen: set[str] = set()
-    for name, strength in names:
-        if name not in HIDDEN:
-            raise unknown_name("hidden effect", name, HIDDEN)
-        if name in seen:
-            raise InputError(f"hidden effect '{name}' is given twice, expected once")
-        if not (np.isfinite(strength) and 0.0 <= strength <= 10.0):
-            raise InputError(f"strength of '{name}' is {strength}, expected 0 to 10")
-        seen.add(name)
-        if strength > 0:
-            rng = np.random.default_rng([seed, zlib.crc32(name.encode()), 0xE1A])
-            HIDDEN[name].switch_on(setup, float(strength), rng)
-    return setup
+    """`switch_on_from` the hidden effects of the PyElastica rig."""
+    return switch_on_from(HIDDEN, setup, names, seed, STREAM)

@@ -21,7 +21,7 @@ from surgisoft.rig.elastica.hidden import EVENT_WINDOW_S, Setup, switch_on
 from surgisoft.rig.elastica.robot import make_robot, vacuum_limit
 from surgisoft.rig.elastica.rod import largest_step
 from surgisoft.rig.elastica.wall import stiffest
-from surgisoft.rig.interface import Sample, Truth, checked_command
+from surgisoft.rig.interface import Sample, Truth, check_simulated, checked_command
 from surgisoft.rig.motion_capture import normals_per_frame, normals_per_pause
 
 REST_S = 30.0
@@ -57,18 +57,7 @@ class ElasticaRigConfig:
 
     def __post_init__(self):
         object.__setattr__(self, "hidden", tuple((name, x) for name, x in self.hidden))
-        if self.seed < 0:
-            raise InputError(f"seed is {self.seed}, expected a whole number >= 0")
-        if self.gravity is not None:
-            direction = np.asarray(self.gravity, np.float64)
-            if direction.shape != (3,) or not np.isfinite(direction).all() or not direction.any():
-                raise InputError(
-                    f"gravity is {direction.tolist()}, expected a direction of three numbers"
-                )
-        if not 0.0 <= self.payload_g <= HEAVIEST_G:
-            raise InputError(f"payload is {self.payload_g} g, expected 0 to {HEAVIEST_G:g} g")
-        if not (np.isfinite(self.noise) and self.noise >= 0.0):
-            raise InputError(f"noise scale is {self.noise}, expected a number >= 0")
+        check_simulated(self.seed, self.gravity, self.payload_g, HEAVIEST_G, self.noise)
         if self.elements < 6:
             raise InputError(f"elements is {self.elements}, expected at least 6")
 

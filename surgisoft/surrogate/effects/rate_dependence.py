@@ -124,7 +124,7 @@ class RateDependence(WallFibres):
             Quantity("share", value_of(self.share), "", 0.0, 1.05, fluid),
             Quantity("tau_s", value_of(self.log_tau.exp()), "s", 0.005, 10.0, rubber),
             Quantity("turn", value_of(self.log_turn.exp()), "", 0.0, 1e4, both),
-            Quantity("others_share", value_of(self.others), "", -1.0, 1.0, "a mixture of shares"),
+            *self.mixture(),
         ]
 
 

@@ -133,10 +133,7 @@ class Softening(WallFibres):
             Quantity("width_share", value_of(self.log_width.exp()), "", 0.001, 5.0, rubber),
             Quantity("growth_share", value_of(self.log_growth.exp()), "", 1e-4, 5.0, rubber),
         ]
-        if self.section:
-            return quantities
-        mixed = "a mixture of shares"
-        return [*quantities, Quantity("others_share", value_of(self.others), "", -1.0, 1.0, mixed)]
+        return [*quantities, *self.mixture()]
 
 
 def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:

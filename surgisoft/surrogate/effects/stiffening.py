@@ -116,10 +116,7 @@ class Stiffening(WallFibres, Memoryless):
             ),
             Quantity("steepness", value_of(self.log_steepness.exp()), "", 0.005, 12.0, rubber),
         ]
-        if self.section:
-            return quantities
-        mixed = "a mixture of shares"
-        return [*quantities, Quantity("others_share", value_of(self.others), "", -1.0, 1.0, mixed)]
+        return [*quantities, *self.mixture()]
 
 
 def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from surgisoft.errors import InputError
-from surgisoft.surrogate.effects.base import Effect
+from surgisoft.surrogate.effects.base import Effect, Quantity, value_of
 
 RINGS = (3, 4)
 """Numbers of chambers that are assumed to stand in one ring; of other numbers nothing is known."""
@@ -47,6 +47,13 @@ class WallFibres(Effect, ABC):
     def fibre_loads(self, signal: Tensor) -> Tensor:
         """(..., K) load of each fibre from the actuation (..., m)."""
         return self.load(signal) @ self.fibres.T
+
+    def mixture(self) -> list[Quantity]:
+        """The mixture of the fibres' loads for `quantities`; none of a section."""
+        if self.section:
+            return []
+        source = "a mixture of shares"
+        return [Quantity("others_share", value_of(self.others), "", -1.0, 1.0, source)]
 
     def config(self) -> dict:
         """Whether the fibres stand in a ring."""

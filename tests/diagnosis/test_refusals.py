@@ -18,8 +18,8 @@ from surgisoft.diagnosis.setup.alignment import Frame
 from surgisoft.diagnosis.setup.correction import Correction
 from surgisoft.diagnosis.setup.sample import Arrangement
 from surgisoft.diagnosis.setup.words import faults_of, joined
-from surgisoft.errors import InputError
 from tests.diagnosis.synthetic import POINTS, recording, still_model, walk
+from tests.refusals import refusal
 
 ROWS = 240
 
@@ -27,14 +27,6 @@ ROWS = 240
 def some(**more):
     """A recording of the still arm that nothing is wrong with."""
     return recording(np.zeros(ROWS), walk(ROWS), **more)
-
-
-def said(call) -> str:
-    """The one line of the InputError that a call raises."""
-    with pytest.raises(InputError) as error:
-        call()
-    assert "\n" not in str(error.value)
-    return str(error.value)
 
 
 def never_finite():
@@ -60,7 +52,7 @@ def test_questions_that_cannot_be_asked_are_one_line():
         (lambda: propose(model, ["creep", "drift"]), "effect 'creep' changes nothing on this arm"),
         (lambda: predicted_arm("lab", [plain]), "lab: the recordings have no predicted key point"),
     ):
-        assert message in said(call)
+        assert message in refusal(call)
 
 
 def test_held_out_rows_are_opened_once():
@@ -112,7 +104,7 @@ def test_the_sentence_of_a_refit_names_what_would_do_as_well():
     assert alone.sentence.endswith("line_lag leaves 0.2 mm of 0.5 mm on held-out runs")
     assert not alone.ambiguous
     both = refit("line_lag", ("creep",))
-    assert both.sentence.endswith("; creep would do about as well")
+    assert both.sentence.endswith("; creep would fit about as well")
     assert (both.ambiguous, both.names) == (True, ("line_lag", "creep"))
     line = refit("line_lag", ("creep",), of_line=True)
     assert line.sentence.endswith("has to pass the line: measure the actuation to tell them apart")
@@ -126,7 +118,7 @@ def test_the_sentence_of_a_refit_names_what_would_do_as_well():
 def test_modes_of_a_refit():
     assert refit_reason(None, "never") == ""
     assert refit_reason(None, "always") == "it was asked for"
-    assert "unknown refit 'perhaps'" in said(lambda: refit_reason(None, "perhaps"))
+    assert "unknown refit 'perhaps'" in refusal(lambda: refit_reason(None, "perhaps"))
 
 
 def test_many_values_are_summed_up():
@@ -153,14 +145,14 @@ def test_a_correction_needs_what_it_takes():
     """The command in the place of a dead channel, and runs that are longer than the offset."""
     base = {"arrangement": PLAIN, "points": (0, 1, 2), "unit": "kPa", "recorded_unit": "kPa"}
     given = some()
-    assert "no commanded actuation (columns c1_kPa ...), expected one in the place of a" in said(
+    assert "no commanded actuation (columns c1_kPa ...), expected one in the place of a" in refusal(
         lambda: Correction(**base, from_command=(1,)).applied(given)
     )
     driven = replace(given, commanded=given.measured + 1.0)
-    mended = Correction(**base, from_command=(1,)).applied(driven)
-    np.testing.assert_allclose(mended.measured[:, 1], driven.commanded[:, 1])
-    np.testing.assert_allclose(mended.measured[:, 0], driven.measured[:, 0])
-    assert "every run is shorter than the offset of the clocks, 1e+03 s; record longer" in said(
+    corrected = Correction(**base, from_command=(1,)).applied(driven)
+    np.testing.assert_allclose(corrected.measured[:, 1], driven.commanded[:, 1])
+    np.testing.assert_allclose(corrected.measured[:, 0], driven.measured[:, 0])
+    assert "every run is shorter than the offset of the clocks, 1e+03 s; record longer" in refusal(
         lambda: Correction(**base, delay_s=1000.0).applied(given)
     )
     late = Correction(**base, delay_s=0.2).applied(driven)

@@ -14,7 +14,6 @@ import pytest
 from scipy.io import savemat
 
 from surgisoft.apart import unpacked
-from surgisoft.errors import InputError
 from surgisoft.measurement.histories import actuation_of
 from surgisoft.measurement.importing import draft_map, import_files, load_map
 from surgisoft.measurement.importing.plausible import plausibility_notes
@@ -40,6 +39,7 @@ from surgisoft.measurement.recordings.predictions import with_predictions
 from surgisoft.measurement.recordings.quality import without_spikes
 from surgisoft.measurement.tables import DelimitedText, label
 from surgisoft.measurement.units import factor, other_units
+from tests.refusals import refusal
 
 
 def recording(rows: int = 8, **more) -> Recording:
@@ -50,14 +50,6 @@ def recording(rows: int = 8, **more) -> Recording:
         "key_points_mm": rng.normal(0, 9, (rows, 2, 3)),
     }  # fmt: skip
     return Recording(**(given | more))
-
-
-def said(call) -> str:
-    """The one line of the InputError that a call raises."""
-    with pytest.raises(InputError) as error:
-        call()
-    assert "\n" not in str(error.value)
-    return str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -79,7 +71,7 @@ def test_a_protocol_that_cannot_be_run_is_one_line(fields, message):
         "name": "p", "kind": "continuous", "commands": np.ones((3, 2)), "run": np.zeros(3),
         "t_s": np.arange(3.0),
     }  # fmt: skip
-    assert message in said(lambda: Protocol(**(given | fields)))
+    assert message in refusal(lambda: Protocol(**(given | fields)))
 
 
 def test_a_lattice_is_the_smallest_with_as_many_points():
@@ -99,7 +91,7 @@ def test_a_lattice_is_the_smallest_with_as_many_points():
     ],
 )
 def test_a_recording_of_another_shape_is_refused(fields, message):
-    assert message in said(lambda: recording(**fields))
+    assert message in refusal(lambda: recording(**fields))
 
 
 def test_paths_that_cannot_hold_a_recording(tmp_path):
@@ -117,7 +109,7 @@ def test_paths_that_cannot_hold_a_recording(tmp_path):
         (lambda: save_recordings(twice[:1], tmp_path / "full"), "exists already, expected a new"),
         (lambda: actuation_of(recording(), "guessed"), "unknown actuation 'guessed'"),
     ):
-        assert message in said(call)
+        assert message in refusal(call)
     check_writable(tmp_path / "full/a.csv", force=True)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["b.csv", "full", "pipe.csv"]
 
@@ -125,7 +117,7 @@ def test_paths_that_cannot_hold_a_recording(tmp_path):
 def test_cells_of_unusual_tables(tmp_path):
     pq.write_table(pa.table({"t_s": [0.0, 1.0], "p1_kPa": [True, False]}), tmp_path / "a.parquet")
     table = open_table(tmp_path / "a.parquet")
-    assert said(lambda: table.numbers([1])).endswith("'p1_kPa': holds bool, expected numbers")
+    assert refusal(lambda: table.numbers([1])).endswith("'p1_kPa': holds bool, expected numbers")
     assert label(["a", "b", "a", ""], 1) == "'b'"
     assert label(["a", "b", "a", ""], 2) == "'a' (3)"
     assert label(["a", "b", "a", ""], 3) == "4"
@@ -160,14 +152,14 @@ def test_a_page_whose_header_makes_no_sense_is_one_line(header, tmp_path):
     with path.open("r+b") as file:
         file.seek(at)
         file.write(header)
-    assert said(lambda: load_recording(path)) == f"{path}: not a readable Parquet file"
+    assert refusal(lambda: load_recording(path)) == f"{path}: not a readable Parquet file"
 
 
 def test_an_empty_parquet_table_is_one_line(tmp_path):
     names = ["t_s", "p1_kPa", "k0_x_mm", "k0_y_mm", "k0_z_mm"]
     empty = pa.table({name: pa.array([], pa.float64()) for name in names})
     pq.write_table(empty, tmp_path / "a.parquet")
-    assert "the table is empty, expected at least one row" in said(
+    assert "the table is empty, expected at least one row" in refusal(
         lambda: load_recording(tmp_path / "a.parquet")
     )
 
@@ -206,7 +198,7 @@ def test_positions_of_another_size_than_the_arm_are_noted():
 def test_orientations_that_are_missing():
     lost = np.full((2, 4), np.nan)
     assert np.isnan(between(lost, lost, np.array([0.5, 0.5]))).all()
-    assert "the base body has no orientation in any row" in said(
+    assert "the base body has no orientation in any row" in refusal(
         lambda: check_pose(np.full((3, 3), np.nan), "a.csv")
     )
     check_pose(np.eye(3), "a.csv")
@@ -253,7 +245,7 @@ def imported(folder, map_text: str, *contents: str, name: str | None = "lab"):
     ],
 )
 def test_raw_files_that_a_map_does_not_fit(measured, raw, message, tmp_path):
-    assert message in said(lambda: imported(tmp_path, BASE.format(measured=measured), raw))
+    assert message in refusal(lambda: imported(tmp_path, BASE.format(measured=measured), raw))
 
 
 def test_maps_that_contradict_themselves(tmp_path):
@@ -265,15 +257,16 @@ def test_maps_that_contradict_themselves(tmp_path):
         (turned, "quaternion: missing; expected the body's orientation, since there is an offset"),
         (both, "temp_C: got a table"),
     ):
-        assert message in said(lambda text=text: imported(tmp_path, text, RAW))
-    assert "no raw file given, expected at least one" in said(lambda: imported(tmp_path, plain))
+        assert message in refusal(lambda text=text: imported(tmp_path, text, RAW))
+    assert "no raw file given, expected at least one" in refusal(lambda: imported(tmp_path, plain))
 
 
 def test_files_of_other_arms_are_no_runs_of_one_recording(tmp_path):
     text = BASE.format(measured="[measured]")
     one, two = RAW.replace("u", "p1_kPa", 1), RAW.replace("u", "p1_psi", 1)
-    assert "raw1: 1 channels in psi and 1 key points, expected 1 in kPa and 1 as in raw0" in said(
-        lambda: imported(tmp_path, text, one, two)
+    assert (
+        "raw1: 1 channels in psi and 1 key points, expected 1 in kPa and 1 as in raw0"
+        in refusal(lambda: imported(tmp_path, text, one, two))
     )
     assert [part.recording.unit for part in imported(tmp_path, text, one, two, name=None)] == [
         "kPa",
@@ -286,7 +279,7 @@ def test_a_log_whose_time_goes_back_cannot_be_matched(tmp_path):
     text += 'time = "t"\n'
     text += BASE.format(measured='[measured]\nfile = "log"\ncolumns = ["u"]\nunit = "kPa"')
     back = "t,u\n0,1\n2,2\n1,3\n"
-    assert "raw1.csv, line 4, column 't': time does not increase" in said(
+    assert "raw1.csv, line 4, column 't': time does not increase" in refusal(
         lambda: imported(tmp_path, text, RAW, back)
     )
 
@@ -295,7 +288,7 @@ def test_a_file_without_arrays_is_one_line(tmp_path):
     np.savez(tmp_path / "a.npz", note=np.array("nothing"))
     (tmp_path / "map.toml").write_text(BASE.format(measured=PLAIN))
     spec = load_map(str(tmp_path / "map.toml"))
-    message = said(lambda: import_files([tmp_path / "a.npz"], spec, "a"))
+    message = refusal(lambda: import_files([tmp_path / "a.npz"], spec, "a"))
     assert message.startswith(str(tmp_path / "a.npz"))
 
 
@@ -304,14 +297,14 @@ def test_a_draft_of_numbers_alone_counts_columns(tmp_path):
     (tmp_path / "a.csv").write_text("x,y,z\n1,2,3\n2,3,4\n")
     assert "# [measured]  # check: no columns of the actuation are" in draft_map(tmp_path / "a.csv")
     (tmp_path / "b.csv").write_text("take seven\n1,2,3\n2,3,4\n")
-    assert "no columns x, y, z of key points are recognised among unnamed" in said(
+    assert "no columns x, y, z of key points are recognised among unnamed" in refusal(
         lambda: draft_map(tmp_path / "b.csv")
     )
 
 
 def test_a_schedule_with_a_hole_names_the_cell(tmp_path):
     (tmp_path / "s.csv").write_text("t_s,c1_kPa\n0,1\n1,nan\n")
-    assert "line 3, column 'c1_kPa': got nan, expected a finite number" in said(
+    assert "line 3, column 'c1_kPa': got nan, expected a finite number" in refusal(
         lambda: load_schedule(tmp_path / "s.csv")
     )
 
@@ -333,10 +326,10 @@ def test_predictions_are_matched_by_run_and_time(tmp_path):
     (found,) = with_predictions([two], [predictions(tmp_path, rows)])
     assert found.predicted_mm[:, 0, 0].tolist() == [1.0, 2.0, 3.0, 4.0]
     plain = predictions(tmp_path, rows, run=False)
-    assert "5 rows, but recording 'rec' has 4 in 2 runs; expected a column 'run'" in said(
+    assert "5 rows, but recording 'rec' has 4 in 2 runs; expected a column 'run'" in refusal(
         lambda: with_predictions([two], [plain])
     )
-    assert "rec" in said(lambda: with_predictions([two], [predictions(tmp_path, rows[:3])]))
+    assert "rec" in refusal(lambda: with_predictions([two], [predictions(tmp_path, rows[:3])]))
 
 
 def foreign(folder, **changes) -> dict:
@@ -358,7 +351,7 @@ def test_datasets_that_cannot_be_written(tmp_path):
         ([single], None, "no run has two samples, expected some"),
         ([apart], 10, "no run of two frames at 10 frames a second"),
     ):
-        assert message in said(
+        assert message in refusal(
             lambda given=given, fps=fps: save_lerobot(given, tmp_path / "s", fps=fps)
         )
         assert not (tmp_path / "s").exists()
@@ -389,11 +382,12 @@ def test_datasets_without_frames_or_with_lost_actuation(tmp_path):
     at = table.column_names.index("observation.state")
     kind = table.schema.field(at).type
     pq.write_table(table.set_column(at, "observation.state", pa.array(states, kind)), file)
-    assert "episode 0, frame 1: the actuation is missing, expected numbers in every frame" in said(
-        lambda: load_lerobot(tmp_path / "a")
+    assert (
+        "episode 0, frame 1: the actuation is missing, expected numbers in every frame"
+        in refusal(lambda: load_lerobot(tmp_path / "a"))
     )
     file.unlink()
-    assert "no data/chunk-*/file-*.parquet, expected the frames there" in said(
+    assert "no data/chunk-*/file-*.parquet, expected the frames there" in refusal(
         lambda: load_lerobot(tmp_path / "a")
     )
 
@@ -418,13 +412,13 @@ def test_the_tail_of_a_log_that_was_never_written(tmp_path):
     """A disk that lost its power leaves blocks of zeros behind the last line."""
     path = tmp_path / "run.jsonl"
     path.write_bytes(b"1\n")
-    assert "line 1: expected a JSON object, not a value" in said(lambda: read_log(path))
+    assert "line 1: expected a JSON object, not a value" in refusal(lambda: read_log(path))
     path.write_bytes(b"\0\0\0\n")
-    assert "is empty, expected a" in said(lambda: read_log(path))
+    assert "is empty, expected a" in refusal(lambda: read_log(path))
 
 
 def test_folders_of_nothing_are_one_line(tmp_path):
-    assert "no .csv or .parquet in this folder" in said(lambda: load_recordings([tmp_path]))
+    assert "no .csv or .parquet in this folder" in refusal(lambda: load_recordings([tmp_path]))
 
 
 TWO = "t,u,x,y,z,a,b,c\n0,1,0,0,0,0,0,9\n1,2,0,0,0,0,1,9\n2,3,0,0,0,0,2,9\n"
@@ -458,19 +452,20 @@ TWO_POINTS = 'positions = [["x", "y", "z"], ["a", "b", "c"]]'
 )
 def test_key_points_that_a_file_does_not_have(points, more, raw, message, tmp_path):
     text = BASE.format(measured=PLAIN).replace('positions = [["x", "y", "z"]]', points) + more
-    assert message in said(lambda: imported(tmp_path, text, raw))
+    assert message in refusal(lambda: imported(tmp_path, text, raw))
 
 
 def test_positions_have_a_unit(tmp_path):
     text = BASE.format(measured=PLAIN).replace('unit = "mm"\n', "")
-    assert "key_points.unit: missing; expected the positions' unit, one of mm, cm, m, in" in said(
-        lambda: imported(tmp_path, text, RAW)
+    assert (
+        "key_points.unit: missing; expected the positions' unit, one of mm, cm, m, in"
+        in refusal(lambda: imported(tmp_path, text, RAW))
     )
 
 
 def test_an_actuation_that_is_read_later_than_every_run(tmp_path):
     text = BASE.format(measured=PLAIN + "\ndelay_s = {}")
-    assert "delay_s 60 (commanded 0) is longer than every run, expected a short time" in said(
+    assert "delay_s 60 (commanded 0) is longer than every run, expected a short time" in refusal(
         lambda: imported(tmp_path, text.format(60), RAW)
     )
     rows = "".join(f"{0.1 * i:.1f},{i},{i},3,4\n" for i in range(20))
@@ -485,11 +480,11 @@ def test_the_topic_of_a_file_of_arrays_is_one_of_its_groups(tmp_path):
     text = '[file.main]\ntopic = "leg"\n' + BASE.format(measured=PLAIN)
     (tmp_path / "map.toml").write_text(text)
     spec = load_map(str(tmp_path / "map.toml"))
-    message = said(lambda: import_files([tmp_path / "a.mat"], spec, "a"))
+    message = refusal(lambda: import_files([tmp_path / "a.mat"], spec, "a"))
     assert message.endswith("no group or struct 'leg', expected one of arm")
     savemat(tmp_path / "a.mat", {"note": "nothing"})
     spec = replace(spec, file={"main": replace(spec.file["main"], topic="")})
-    message = said(lambda: import_files([tmp_path / "a.mat"], spec, "a"))
+    message = refusal(lambda: import_files([tmp_path / "a.mat"], spec, "a"))
     assert message.endswith("no array of numbers in it, expected time and measurements")
 
 
@@ -527,7 +522,7 @@ class FakeC3d:
 )
 def test_c3d_files_without_frames_are_one_line(file, fields, message, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ezc3d", FakeC3d(**fields))
-    assert said(lambda: as_bytes(tmp_path / file)).endswith(f"{file}: {message}")
+    assert refusal(lambda: as_bytes(tmp_path / file)).endswith(f"{file}: {message}")
 
 
 def test_voltages_of_a_c3d_file_are_averaged_over_its_frames(tmp_path, monkeypatch):
@@ -550,4 +545,4 @@ def test_a_missing_reader_is_named_with_its_extra(tmp_path, monkeypatch):
         (object(), "its first bytes are not those of a C3D file; export it again"),
     ):
         monkeypatch.setattr(c3d, "find_spec", lambda name, found=found: found)
-        assert expected in said(lambda: c3d.READER.read(tmp_path / "a.c3d", None))
+        assert expected in refusal(lambda: c3d.READER.read(tmp_path / "a.c3d", None))

@@ -29,16 +29,9 @@ from surgisoft.scene.mounted_arm import placed
 from surgisoft.scene.repair import repair
 from surgisoft.scene.segmentation import parse_label, read_image, read_segmentation
 from surgisoft.scene.spec import PHANTOM, LesionSpec, load_spec
+from tests.refusals import refusal
 from tests.scene.shapes import ball, box
 from tests.scene.test_contours import disc, spec
-
-
-def said(call) -> str:
-    """The one line of the InputError that a call raises."""
-    with pytest.raises(InputError) as error:
-        call()
-    assert "\n" not in str(error.value)
-    return str(error.value)
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +54,7 @@ def test_paths_that_cannot_be_cut_are_one_line(plane):
         (lambda: cut_patch(plane, two, two, np.zeros(3), 0.2), "ring has shape (2, 3): expected"),
         (lambda: cut_patch(plane, disc(5.0), disc(5.0), np.zeros(3), -0.2), "spacing -0.2 mm"),
     ):
-        assert message in said(call)
+        assert message in refusal(call)
 
 
 def test_lesions_that_cannot_vary_are_one_line():
@@ -71,15 +64,18 @@ def test_lesions_that_cannot_vary_are_one_line():
     own = replace(lesion, path_mm=((0.0, 0.0, 50.0),) * 3)
     block = box((30.0, 30.0, 30.0))
     wide = LesionSpec("organ", (0.0, 0.0, 15.0), 29.0)
-    assert "lesions up to 14 mm aside and 0 % larger fit on 'organ'; use a smaller spread" in said(
-        lambda: lesions_like(block, wide, 3, 14.0, 0.0)
+    assert (
+        "lesions up to 14 mm aside and 0 % larger fit on 'organ'; use a smaller spread"
+        in refusal(lambda: lesions_like(block, wide, 3, 14.0, 0.0))
     )
     for given, shift_mm, size, message in (
         (own, 1.0, 0.0, "a lesion with its own path_mm cannot be moved or scaled; leave both at 0"),
         (lesion, 0.0, 1.0, "lesions differ in size by a share of 1.0; expected 0 to below 1"),
         (lesion, 30.0, 0.0, "lesions move by up to 30 mm; expected at most the scene's own diame"),
     ):
-        assert message in said(lambda a=given, b=shift_mm, c=size: lesions_like(mesh, a, 3, b, c))
+        assert message in refusal(
+            lambda a=given, b=shift_mm, c=size: lesions_like(mesh, a, 3, b, c)
+        )
     found = lesions_like(mesh, lesion, 4, 5.0, 0.2)
     assert len(found) == 4
     assert all(16.0 <= each.diameter_mm <= 24.0 for each in found)
@@ -88,9 +84,9 @@ def test_lesions_that_cannot_vary_are_one_line():
 def test_where_no_ring_fits_the_line_says_so():
     """A needle of 2 mm: a ring of 20 mm fits nowhere, and no smaller one."""
     needle = OrganSurface.whole(box((2.0, 2.0, 60.0)))
-    message = said(lambda: pointed_site([needle], np.array([0.0, 0.0, 30.0]), 20.0))
+    message = refusal(lambda: pointed_site([needle], np.array([0.0, 0.0, 30.0]), 20.0))
     assert "a ring of 20 mm does not fit on the surface at" in message
-    assert said(lambda: good_sites([needle], 20.0))
+    assert refusal(lambda: good_sites([needle], 20.0))
 
 
 def test_damaged_surfaces_beyond_repair_are_one_line():
@@ -106,7 +102,7 @@ def test_damaged_surfaces_beyond_repair_are_one_line():
         (np.zeros((3, 3)), np.array([[0, 1, 2]]), "all vertices are one point; expected a surface"),
         (np.eye(3), np.array([[0, 0, 1]] * 5), "0 faces enclose nothing; expected a closed body"),
     ):
-        assert message in said(lambda p=points, t=triangles: repair(p, t, "organ"))
+        assert message in refusal(lambda p=points, t=triangles: repair(p, t, "organ"))
 
 
 def test_two_holes_that_share_a_corner_are_both_closed():
@@ -174,13 +170,13 @@ SPEC = (PHANTOM / "scene.toml").read_text()
 )
 def test_a_scene_without_its_parts_is_one_line(old, new, message, tmp_path):
     (tmp_path / "scene.toml").write_text(SPEC.replace(old, new))
-    assert message in said(lambda: load_spec(tmp_path / "scene.toml"))
+    assert message in refusal(lambda: load_spec(tmp_path / "scene.toml"))
 
 
 def test_arms_of_a_scene_go_by_their_names():
     found = open_scene(PHANTOM).spec
     assert found.mount("laser").tool == "laser"
-    assert said(lambda: found.mount("knife")).startswith("unknown arm 'knife': known are")
+    assert refusal(lambda: found.mount("knife")).startswith("unknown arm 'knife': known are")
 
 
 def test_targets_that_are_no_scene_are_kept(tmp_path):
@@ -193,9 +189,11 @@ def test_targets_that_are_no_scene_are_kept(tmp_path):
         (tmp_path / "folder", "is no scene; --force replaces only a scene's folder"),
         (tmp_path / "file" / "new", "cannot be written"),
     ):
-        assert message in said(lambda p=place: check_target(p, force=True))
+        assert message in refusal(lambda p=place: check_target(p, force=True))
     check_target(tmp_path / "empty", force=True)
-    assert "exists already; choose another" in said(lambda: check_target(tmp_path / "empty", False))
+    assert "exists already; choose another" in refusal(
+        lambda: check_target(tmp_path / "empty", False)
+    )
 
 
 def test_requests_that_contradict_each_other(tmp_path):
@@ -219,7 +217,7 @@ def test_requests_that_contradict_each_other(tmp_path):
             "all vertices are one point; expected a surface",
         ),
     ):
-        assert message in said(lambda r=request: prepare(r))
+        assert message in refusal(lambda r=request: prepare(r))
 
 
 def glb(table: dict, tail: bytes = b"") -> bytes:
@@ -243,7 +241,7 @@ def glb(table: dict, tail: bytes = b"") -> bytes:
 )
 def test_mesh_files_that_claim_too_much_are_one_line(name, content, message, tmp_path):
     (tmp_path / name).write_bytes(content)
-    assert message in said(lambda: read_parts(tmp_path / name))
+    assert message in refusal(lambda: read_parts(tmp_path / name))
 
 
 nrrd = pytest.importorskip("nrrd", reason="the extra 'segmentation' is not installed")
@@ -295,9 +293,9 @@ def test_images_that_are_no_volume_are_one_line(tmp_path):
         if name == "plane":
             image.set_sform(affine, 1)
         nibabel.save(image, path)
-        assert message in said(lambda p=path: read_image(p)), name
+        assert message in refusal(lambda p=path: read_image(p)), name
     nrrd.write(str(tmp_path / "five.nrrd"), np.zeros((2, 2, 4, 4, 4), np.uint8))
-    assert "an image of shape" in said(lambda: read_image(tmp_path / "five.nrrd"))
+    assert "an image of shape" in refusal(lambda: read_image(tmp_path / "five.nrrd"))
 
 
 def test_labels_that_make_no_body_are_one_line(tmp_path):
@@ -311,10 +309,10 @@ def test_labels_that_make_no_body_are_one_line(tmp_path):
         "left out: 2, 3; name them with --label" in n for n in read_segmentation(path, one).notes
     )
     tiny = [*one, parse_label("2:support")]
-    assert "label '2' has" in said(lambda: read_segmentation(path, tiny))
-    assert "unknown role 'ghost'" in said(lambda: parse_label("1:ghost"))
+    assert "label '2' has" in refusal(lambda: read_segmentation(path, tiny))
+    assert "unknown role 'ghost'" in refusal(lambda: parse_label("1:ghost"))
     two = [parse_label("1:organ"), parse_label("2:organ")]
-    assert "2 labels with the role organ and 0" in said(lambda: read_segmentation(path, two))
+    assert "2 labels with the role organ and 0" in refusal(lambda: read_segmentation(path, two))
 
 
 def test_files_after_the_first_have_its_unit_unless_their_format_has_one(tmp_path):
@@ -336,7 +334,7 @@ def test_files_after_the_first_have_its_unit_unless_their_format_has_one(tmp_pat
     given = Request(meshes=(tmp_path / "c.glb",), roles=("organ",), unit="inch", up="z")
     assert any(note.startswith("c.glb: unit inch") for note in prepare(given).notes)
     wrong = Request(meshes=(tmp_path / "a.stl",), roles=("organ", "ghost"))
-    assert "unknown role 'ghost'" in said(lambda: prepare(wrong))
+    assert "unknown role 'ghost'" in refusal(lambda: prepare(wrong))
 
 
 def test_parts_that_only_together_enclose_a_body_are_one_surface(tmp_path):
@@ -372,6 +370,6 @@ def test_names_of_bodies_are_unique_and_plain(tmp_path):
 def test_paths_far_from_the_organ_have_no_patch(plane):
     away = contour_path(plane, spec(points_mm=disc(5.0).tolist()), 0.25)
     moved = replace(away, points_mm=away.points_mm + np.array([500.0, 0.0, 0.0]))
-    assert "the paths lie nowhere near the organ's surface" in said(
+    assert "the paths lie nowhere near the organ's surface" in refusal(
         lambda: path_patch(plane, [moved], 0.5, 2.0)
     )

@@ -16,6 +16,7 @@ from surgisoft.tasks.circle_ablation import CircleAblation, CircleAblationConfig
 from surgisoft.tasks.world.arm import Randomisation
 from surgisoft.tasks.world.pytree import rows
 from surgisoft.tasks.world.world import WorldConfig
+from tests.tasks.scripted import scripted_states
 
 
 @pytest.fixture(scope="module")
@@ -27,16 +28,7 @@ def quick():
 @pytest.fixture(scope="module")
 def cut(quick):
     """States and outcomes of two scripted episodes to the end of both."""
-    episodes = Episodes(quick)
-    states, outcomes = [episodes.seeded(0, 2)], []
-    with torch.inference_mode():
-        over = torch.zeros(2, dtype=torch.bool)
-        while not over.all() and len(outcomes) < 300:
-            state, outcome = episodes.step(states[-1], quick.script(states[-1]))
-            states.append(state)
-            outcomes.append(outcome)
-            over |= outcome.done
-    return states, outcomes
+    return scripted_states(quick)
 
 
 def test_the_script_cuts_the_whole_ring(cut):

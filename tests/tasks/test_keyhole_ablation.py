@@ -11,6 +11,7 @@ from surgisoft.scene.spec import PHANTOM
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.keyhole_ablation import KeyholeAblation, KeyholeAblationConfig
 from surgisoft.tasks.world.world import Feed
+from tests.tasks.scripted import scripted_states
 
 
 @pytest.fixture(scope="module")
@@ -22,16 +23,7 @@ def quick():
 @pytest.fixture(scope="module")
 def cut(quick):
     """States and outcomes of two scripted episodes to the end of both."""
-    episodes = Episodes(quick)
-    states, outcomes = [episodes.seeded(0, 2)], []
-    with torch.inference_mode():
-        over = torch.zeros(2, dtype=torch.bool)
-        while not over.all() and len(outcomes) < 300:
-            state, outcome = episodes.step(states[-1], quick.script(states[-1]))
-            states.append(state)
-            outcomes.append(outcome)
-            over |= outcome.done
-    return states, outcomes
+    return scripted_states(quick)
 
 
 def with_clearance(state, bodies_mm):

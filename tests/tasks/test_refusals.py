@@ -27,14 +27,7 @@ from surgisoft.tasks.world.random_streams import streams
 from surgisoft.tasks.world.reach import blank_mounts
 from surgisoft.tasks.world.respiration import Respiration
 from surgisoft.tasks.world.scene import only
-
-
-def said(call) -> str:
-    """The one line of the InputError that a call raises."""
-    with pytest.raises(InputError) as error:
-        call()
-    assert "\n" not in str(error.value)
-    return str(error.value)
+from tests.refusals import refusal
 
 
 @pytest.mark.parametrize(
@@ -63,7 +56,7 @@ def said(call) -> str:
     ],
 )
 def test_what_cannot_be_meant_is_one_line(make, message):
-    assert message in said(make)
+    assert message in refusal(make)
 
 
 def test_a_weight_that_is_no_number_is_named():
@@ -77,8 +70,9 @@ def test_an_arm_model_without_a_length_cannot_be_mounted(tmp_path):
     arm = default_arm()
     arm.spec = dataclasses.replace(arm.spec, length_mm=None)
     save_model(arm, tmp_path / "arm")
-    assert "the arm model states no length; fit it to recordings whose sidecar has length" in said(
-        lambda: blank_mounts(["laser"], {"laser": str(tmp_path / "arm")})
+    assert (
+        "the arm model states no length; fit it to recordings whose sidecar has length"
+        in refusal(lambda: blank_mounts(["laser"], {"laser": str(tmp_path / "arm")}))
     )
 
 
@@ -89,7 +83,7 @@ def task():
 
 def test_actions_and_calls_of_another_shape_are_refused(task):
     adapter = NumpyAdapter(task)
-    assert "action of 'arm' has shape (2,), expected (3,)" in said(
+    assert "action of 'arm' has shape (2,), expected (3,)" in refusal(
         lambda: adapter.checked({"arm": np.zeros(2)})
     )
     assert adapter.checked({"arm": np.zeros(3)})["arm"].dtype == np.float32
@@ -98,13 +92,13 @@ def test_actions_and_calls_of_another_shape_are_refused(task):
         BatchedEnv("track_circle", num_envs=2),
         parallel_env("track_circle"),
     )
-    assert "step before reset: call reset() first" in said(lambda: single.step(np.zeros(3)))
-    assert "step before reset: call reset() first" in said(lambda: vector.step(np.zeros((2, 3))))
-    assert "state before reset: call reset() first" in said(several.state)
+    assert "step before reset: call reset() first" in refusal(lambda: single.step(np.zeros(3)))
+    assert "step before reset: call reset() first" in refusal(lambda: vector.step(np.zeros((2, 3))))
+    assert "state before reset: call reset() first" in refusal(several.state)
 
 
 def test_one_agent_of_a_task_is_one_of_its_own(task):
-    assert "unknown agent 'laser': known are arm" in said(lambda: one_agent(task, "laser"))
+    assert "unknown agent 'laser': known are arm" in refusal(lambda: one_agent(task, "laser"))
     alone = one_agent(task, "arm")
     assert (alone.agents, alone.name, alone.steps) == (("arm",), task.name, task.steps)
     with pytest.raises(AttributeError):
@@ -126,11 +120,11 @@ def test_a_task_of_another_package_is_what_it_says(monkeypatch):
     loads = {"number": lambda: 5, "other": lambda: other, "broken": lambda: 1 / 0}
     offered = {name: Entry(name, load) for name, load in loads.items()}
     monkeypatch.setattr(registry, "_offered", lambda path: offered)
-    assert "task 'number' (m:x): is a int, expected a surgisoft.tasks.spec.TaskSpec" in said(
+    assert "task 'number' (m:x): is a int, expected a surgisoft.tasks.spec.TaskSpec" in refusal(
         lambda: make_task("number")
     )
-    assert "task 'other': its name is 'b', expected 'other'" in said(lambda: make_task("other"))
-    assert "task 'broken' (m:x): does not load (ZeroDivisionError: division by zero)" in said(
+    assert "task 'other': its name is 'b', expected 'other'" in refusal(lambda: make_task("other"))
+    assert "task 'broken' (m:x): does not load (ZeroDivisionError: division by zero)" in refusal(
         lambda: make_task("broken")
     )
 
@@ -168,7 +162,7 @@ def test_the_rule_of_a_gated_cut_names_its_gate():
         BreathingAblationConfig(mode="gated", gate_mm=0.5)
     )
     assert "exhalation" not in success_rule(BreathingAblationConfig(mode="follow"))
-    assert "unknown mode 'wait'" in said(lambda: BreathingAblationConfig(mode="wait"))
+    assert "unknown mode 'wait'" in refusal(lambda: BreathingAblationConfig(mode="wait"))
 
 
 def test_episodes_go_on_without_a_seed():
@@ -186,4 +180,4 @@ def test_an_episode_file_of_another_numpy_is_one_line(tmp_path):
     path = tmp_path / "a.npz"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("a.npy", b"\x93NUMPY\x09\x00" + b"\0" * 20)
-    assert "'a.npy' has an unknown version of .npy" in said(lambda: load_episode(path))
+    assert "'a.npy' has an unknown version of .npy" in refusal(lambda: load_episode(path))

@@ -7,9 +7,9 @@ import torch
 
 from surgisoft.errors import InputError
 from surgisoft.scene.spec import PHANTOM
-from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.registry import make_task
 from surgisoft.tasks.two_laser_ring import LASERS, TwoLaserRing, TwoLaserRingConfig
+from tests.tasks.scripted import scripted_states
 
 
 @pytest.fixture(scope="module")
@@ -21,16 +21,7 @@ def quick():
 @pytest.fixture(scope="module")
 def cut(quick):
     """States and outcomes of two scripted episodes to the end of both."""
-    episodes = Episodes(quick)
-    states, outcomes = [episodes.seeded(0, 2)], []
-    with torch.inference_mode():
-        over = torch.zeros(2, dtype=torch.bool)
-        while not over.all() and len(outcomes) < 200:
-            state, outcome = episodes.step(states[-1], quick.script(states[-1]))
-            states.append(state)
-            outcomes.append(outcome)
-            over |= outcome.done
-    return states, outcomes
+    return scripted_states(quick, most=200)
 
 
 def with_arm(state, name, **fields):

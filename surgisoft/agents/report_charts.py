@@ -269,7 +269,7 @@ def broken_at_jumps(points: np.ndarray) -> np.ndarray:
     return np.insert(points, np.flatnonzero(jump) + 1, np.nan, axis=0)
 
 
-UNORDERED = ("chamber", "specimen")
+UNORDERED = ("chamber", "robot_seed", "specimen")
 """Fields of an experiment whose numbers are names: nothing lies between two of them."""
 BESIDE = 0.12
 """Distance of the marks of two lines at the same value of such a field."""

@@ -91,9 +91,9 @@ class PhaseControllers:
         for agent in task.agents:
             chambers = task.world.arms[agent].chambers
             used = {phase.controller(agent) for phase in spec.phases}
-            for driver in spec.drivers:
-                if driver.name in used:
-                    self.defined[agent, driver.name] = _defined(driver, chambers)
+            for own in spec.controllers:
+                if own.name in used:
+                    self.defined[agent, own.name] = _defined(own, chambers)
 
     @torch.inference_mode()
     def act(

@@ -31,6 +31,8 @@ from surgisoft.tasks.registry import with_fields, with_present_names
 Value = int | float | str
 MOST_SETTINGS = 100_000
 """Most settings of an experiment."""
+ROBOT_SEED = ("rig.robot_seed", "rig.specimen")
+"""Names of the field that varies the robot: the present one and that of earlier versions."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,7 @@ def _check_vary(spec: Experiment, vary: Vary, place: Where) -> None:
                 raise (place / "values" / i).error(
                     f"{error}", "a value that the task takes"
                 ) from None
-    elif vary.field == "rig.specimen":
+    elif vary.field in ROBOT_SEED:
         bad = [value for value in vary.values if not isinstance(value, int) or value < 0]
         if bad:
             raise (place / "values").error(f"got {bad[0]}", "whole numbers from 0")
@@ -115,7 +117,7 @@ def _check_vary(spec: Experiment, vary: Vary, place: Where) -> None:
     else:
         raise (place / "field").error(
             f"got '{vary.field}'",
-            "task.NAME, hidden.EFFECT, rig.specimen, or (with faults) fault.chamber, fault.at_s",
+            "task.NAME, hidden.EFFECT, rig.robot_seed, or (with faults) fault.chamber, fault.at_s",
         )
 
 
@@ -157,10 +159,10 @@ def rig_config(setting: Setting, place: Where, arms: Sequence[str]) -> RigConfig
                 raise (place / "cases").error(
                     f"unknown hidden effect '{name}'", f"one of {', '.join(sorted(hidden_of(rig)))}"
                 )
-    specimen = int(varied.get("rig.specimen", setting.case.specimen))
+    seeds = [varied[name] for name in ROBOT_SEED if name in varied] or [setting.case.robot_seed]
     pairs = tuple((name, strength) for name, strength in hidden.items() if strength > 0.0)
     return RigConfig(
-        seed=specimen, hidden=pairs, rigs=setting.case.rigs, preflight=setting.case.preflight
+        seed=int(seeds[0]), hidden=pairs, rigs=setting.case.rigs, preflight=setting.case.preflight
     )
 
 

@@ -144,7 +144,7 @@ def check_playable(spec: Experiment) -> None:
     for setting in found:
         case = setting.case
         if (case.policy, case.arm) not in seen:
-            plain = replace(case, plant="simulation", hidden=(), specimen=0, rigs=Case.rigs)
+            plain = replace(case, plant="simulation", hidden=(), robot_seed=0, rigs=Case.rigs)
             opened(spec, replace(setting, case=plain))
             seen.add((case.policy, case.arm))
 

@@ -74,7 +74,7 @@ class Phase:
     """Longest time in this phase, s."""
     arms: tuple[tuple[Name, Name], ...] = ()
     """(arm, controller) for each arm of the task, in the file as `ARM = "CONTROLLER"`: hold (the
-    default), rest, scripted, policy, or one of `drivers`."""
+    default), rest, scripted, policy, or one of `controllers`."""
     beam: bool = False
     """Whether the phase permits the beam; the interlock must permit it, too."""
     until: str = "never"
@@ -117,7 +117,7 @@ class Case:
     """
     hidden: tuple[str, ...] = ()
     """On the rig: hidden effects, NAME or NAME:AMPLITUDE."""
-    specimen: Seed = 0
+    robot_seed: Seed = 0
     """On a simulated rig: seed of the robot."""
     rigs: tuple[str, ...] = ("virtual",)
     """On the rig: `NAME[:option=value,...]` for all arms, or `ARM=NAME[:...]` for one of them."""
@@ -144,8 +144,8 @@ class Vary:
     """A field that varies over several values; several such fields make a grid."""
 
     field: str
-    """`task.NAME` (dots go deeper), `hidden.EFFECT` (amplitude, on the rig), `rig.specimen`,
-    `fault.chamber` or `fault.at_s`."""
+    """`task.NAME` (dots go deeper), `hidden.EFFECT` (amplitude, on the rig),
+    `rig.robot_seed`, `fault.chamber` or `fault.at_s`."""
     values: Annotated[
         tuple[int | float | str, ...], Rule("a list of at least one value", lambda v: len(v) > 0)
     ]
@@ -205,7 +205,7 @@ class Experiment:
     """Lesions to cut; none: that of the scene."""
     vary: tuple[Vary, ...] = ()
     """Fields that vary."""
-    drivers: tuple[ControllerSpec, ...] = ()
+    controllers: tuple[ControllerSpec, ...] = ()
     """User-defined controllers that phases name."""
     faults: tuple[Fault, ...] = ()
     """Failures that are injected."""
@@ -250,9 +250,22 @@ def load_experiment(path: str | Path) -> Experiment:
     plain |= {"scene": ""} if "scene" in plain else {}
     task = task_config(of, merged(plain, with_present_names(of.config, given)), where)
     table["phases"] = _with_arms(table.get("phases"), of.agents)
+    _rename(table, "drivers", "controllers", where)
+    for i, case in enumerate(cases if isinstance(cases := table.get("cases"), list) else []):
+        if isinstance(case, dict):
+            _rename(case, "specimen", "robot_seed", where / "cases" / i)
     spec = dataclasses.replace(from_table(Experiment, table, where), task=task)
     _check_whole(spec, where)
     return _absolute(spec, where)
+
+
+def _rename(table: dict, former: str, present: str, where: Where) -> None:
+    """Give a field its present name; an InputError where the table has both names."""
+    if former not in table:
+        return
+    if present in table:
+        raise (where / former).error(f"got {former} and {present}", f"{present} alone")
+    table[present] = table.pop(former)
 
 
 def _with_arms(phases: Any, agents: tuple[str, ...]) -> Any:
@@ -293,9 +306,9 @@ def save_experiment(spec: Experiment, path: Path) -> None:
         {name: value for name, value in phase.items() if name != "arms"} | dict(phase["arms"])
         for phase in table["phases"]
     ]
-    for driver in table["drivers"]:
-        if driver["schedule"]:
-            driver["schedule"] = _from_folder(driver["schedule"], folder)
+    for controller in table["controllers"]:
+        if controller["schedule"]:
+            controller["schedule"] = _from_folder(controller["schedule"], folder)
     for case in table["cases"]:
         for name in ("policy", "arm"):
             if case[name] not in ("", "default", SCRIPTED, NOMINAL):
@@ -352,23 +365,23 @@ def _absolute(spec: Experiment, where: Where) -> Experiment:
             arm = there(arm, place / "arm", "default, or an arm model's folder")
         return dataclasses.replace(case, policy=policy, arm=arm)
 
-    def of_driver(i: int, driver: ControllerSpec) -> ControllerSpec:
-        if not driver.schedule:
-            return driver
-        place = where / "drivers" / i / "schedule"
-        return dataclasses.replace(driver, schedule=there(driver.schedule, place, "a CSV file"))
+    def of_controller(i: int, own: ControllerSpec) -> ControllerSpec:
+        if not own.schedule:
+            return own
+        place = where / "controllers" / i / "schedule"
+        return dataclasses.replace(own, schedule=there(own.schedule, place, "a CSV file"))
 
     return dataclasses.replace(
         spec,
         scene=there(spec.scene, where / "scene", "a scene's folder") if spec.in_scene else "",
         cases=tuple(of_case(i, case) for i, case in enumerate(spec.cases)),
-        drivers=tuple(of_driver(i, driver) for i, driver in enumerate(spec.drivers)),
+        controllers=tuple(of_controller(i, own) for i, own in enumerate(spec.controllers)),
     )
 
 
 def _check_whole(spec: Experiment, where: Where) -> None:
     """Raise an InputError for fields that do not fit each other."""
-    for name in ("phases", "cases", "lesions", "drivers"):
+    for name in ("phases", "cases", "lesions", "controllers"):
         _check_names(getattr(spec, name), where / name)
     for name in ("phases", "cases"):
         if not getattr(spec, name):
@@ -383,16 +396,14 @@ def _check_whole(spec: Experiment, where: Where) -> None:
         )
     if spec.lesions and not spec.in_scene:
         raise (where / "lesions").error("got lesions", f"none: {spec.scenario} has no scene")
-    defined = [driver.name for driver in spec.drivers]
-    for i, driver in enumerate(spec.drivers):
-        place = where / "drivers" / i
-        if driver.name in CONTROLLERS:
-            raise (place / "name").error(
-                f"got '{driver.name}'", f"none of {', '.join(CONTROLLERS)}"
-            )
-        if bool(driver.schedule) == bool(driver.waypoints):
+    defined = [own.name for own in spec.controllers]
+    for i, own in enumerate(spec.controllers):
+        place = where / "controllers" / i
+        if own.name in CONTROLLERS:
+            raise (place / "name").error(f"got '{own.name}'", f"none of {', '.join(CONTROLLERS)}")
+        if bool(own.schedule) == bool(own.waypoints):
             raise place.error("got both or neither", "either a schedule or waypoints")
-        times = [row[0] for row in driver.waypoints]
+        times = [row[0] for row in own.waypoints]
         if times and (times[0] < 0.0 or sorted(set(times)) != times):
             raise (place / "waypoints").error(f"times {times}", "times that rise from 0 s")
     conditions = spec.of.experiment.conditions
@@ -417,9 +428,9 @@ def _check_whole(spec: Experiment, where: Where) -> None:
             f"got '{spec.limits.retreat}'", f"one of the phases: {', '.join(known)}"
         )
     for i, case in enumerate(spec.cases):
-        if case.plant != "rig" and (case.hidden or case.specimen or case.rigs != Case.rigs):
+        if case.plant != "rig" and (case.hidden or case.robot_seed or case.rigs != Case.rigs):
             raise (where / "cases" / i).error(
-                "hidden, specimen or rigs in simulation", "them with plant = 'rig' only"
+                "hidden, robot_seed or rigs in simulation", "them with plant = 'rig' only"
             )
 
 

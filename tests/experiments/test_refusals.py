@@ -53,7 +53,7 @@ def test_values_that_cannot_vary_are_named(field, values, message, tmp_path):
 
 def test_hidden_effects_and_robots_vary_on_the_rig(tmp_path):
     text = TINY + RIG + VARY.format(field="hidden.creep", values="0.0, 2.0")
-    text += VARY.format(field="rig.specimen", values="3, 4")
+    text += VARY.format(field="rig.robot_seed", values="3, 4")
     spec = spec_of(tmp_path, text)
     found = [rig_config(each, None, spec.of.agents) for each in settings(spec)]
     assert [(each.seed, each.hidden) for each in found] == [
@@ -122,9 +122,9 @@ def phased(tmp_path_factory):
     text = TINY.replace('laser = "policy"', 'laser = "push"').replace(
         'name = "look"\nendoscope = "policy"', 'name = "look"\nendoscope = "rest"\nlaser = "go"'
     )
-    text += '[[drivers]]\nname = "push"\nschedule = "push.csv"\n'
-    text += '[[drivers]]\nname = "go"\nwaypoints = [[0.0, 0.0, 0.0, 0.0]]\n'
-    text += '[[drivers]]\nname = "unused"\nwaypoints = [[0.0, 0.0, 0.0, 0.0]]\n'
+    text += '[[controllers]]\nname = "push"\nschedule = "push.csv"\n'
+    text += '[[controllers]]\nname = "go"\nwaypoints = [[0.0, 0.0, 0.0, 0.0]]\n'
+    text += '[[controllers]]\nname = "unused"\nwaypoints = [[0.0, 0.0, 0.0, 0.0]]\n'
     spec = spec_of(folder, text)
     task = PhasedTask(LaserSupervision(CircleAblation(replace(spec.task, scene=spec.scene))), spec)
     return spec, task, Episodes(task).seeded(0, 2)
@@ -168,7 +168,7 @@ def test_a_folder_of_experiments_is_that_of_its_scene(tmp_path):
 
 def test_a_copy_of_an_experiment_names_its_files_from_its_own_folder(tmp_path):
     (tmp_path / "push.csv").write_text("t_s,c1_kPa,c2_kPa,c3_kPa\n0,0,0,0\n1,1,1,1\n")
-    text = TINY + '[[drivers]]\nname = "unused"\nschedule = "push.csv"\n'
+    text = TINY + '[[controllers]]\nname = "unused"\nschedule = "push.csv"\n'
     spec = spec_of(tmp_path, text)
     (tmp_path / "results").mkdir()
     save_experiment(spec, tmp_path / "results" / "experiment.toml")

@@ -231,7 +231,7 @@ def test_an_experiment_and_evaluate_by_its_rules_give_the_same_episodes(tmp_path
     """The packaged policy on robot 1 of the rig: every number of an episode."""
     brief = TINY.replace("[task]", "[task.world.randomisation]\nhistory = 1\n\n[task]")
     spec = load_experiment(write(tmp_path, brief))
-    spec = replace(spec, cases=(Case(name="rig", plant="rig", specimen=1),))
+    spec = replace(spec, cases=(Case(name="rig", plant="rig", robot_seed=1),))
     *_, setting = settings(with_policy(spec, "ring"))
     assert setting.case.policy != "scripted"
     (row,) = experiment_run.roll_out_block(spec, setting, 0, 1).rows

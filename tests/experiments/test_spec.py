@@ -68,7 +68,7 @@ VARY = '[[vary]]\nfield = "{field}"\nvalues = [{values}]\n'
         ("hidden.grep", "1.0", "vary[0].field"),
         ("fault.chamber", "1", "vary[0].field"),
         ("mount", "1.0", "vary[0].field"),
-        ("rig.specimen", "0.5", "vary[0].values"),
+        ("rig.robot_seed", "0.5", "vary[0].values"),
     ],
 )
 def test_what_cannot_vary_is_named(field, values, place, tmp_path):
@@ -89,7 +89,7 @@ def test_what_varies_makes_a_grid(tmp_path):
 
 def test_hidden_effects_are_for_the_rig(tmp_path):
     case = '[[cases]]\nname = "a"\nhidden = ["creep"]\n'
-    with pytest.raises(InputError, match=r"cases\[0\]: hidden, specimen or rigs in simulation"):
+    with pytest.raises(InputError, match=r"cases\[0\]: hidden, robot_seed or rigs in simulation"):
         load_experiment(write(tmp_path, TINY + case))
     text = TINY + case.replace('"creep"', '"grep"') + 'plant = "rig"\n'
     with pytest.raises(InputError, match="unknown hidden effect 'grep'"):
@@ -158,18 +158,20 @@ def test_a_scenario_that_is_no_name_is_one_line(tmp_path, value):
 
 
 LESION = '[[phases]]\nname = "a"\ntimeout_s = 1.0\n[[lesions]]\nname = "b"\ncentre_mm = [0, 0, 0]\n'
-DRIVER = '[[drivers]]\nname = "{name}"\n{what}\n'
+CONTROLLER = '[[controllers]]\nname = "{name}"\n{what}\n'
 CONTRADICTIONS = {
     "task: got": ("", "task = 1\n"),
     "task.scene: does not belong here": ("", '[task]\nscene = "x"\n'),
     "phases: none is given": ("", "phases = []\n"),
-    "drivers[0].name: got 'policy'; expected none of": (
-        DRIVER.format(name="policy", what="waypoints = [[0.0, 1.0, 1.0, 1.0]]"),
+    "controllers[0].name: got 'policy'; expected none of": (
+        CONTROLLER.format(name="policy", what="waypoints = [[0.0, 1.0, 1.0, 1.0]]"),
         "",
     ),
-    "drivers[0]: got both or neither": (DRIVER.format(name="mine", what=""), ""),
-    "drivers[0].waypoints: times [1.0, 1.0]": (
-        DRIVER.format(name="mine", what="waypoints = [[1.0, 1.0, 1.0, 1.0], [1.0, 2.0, 2.0, 2.0]]"),
+    "controllers[0]: got both or neither": (CONTROLLER.format(name="mine", what=""), ""),
+    "controllers[0].waypoints: times [1.0, 1.0]": (
+        CONTROLLER.format(
+            name="mine", what="waypoints = [[1.0, 1.0, 1.0, 1.0], [1.0, 2.0, 2.0, 2.0]]"
+        ),
         "",
     ),
     "phases: got integer 1; expected a list": ("", "phases = 1\n"),
@@ -188,18 +190,18 @@ def test_lesions_belong_to_a_scene(tmp_path):
         load_experiment(path)
 
 
-def test_paths_of_a_driver_and_of_an_arm_follow_the_configuration(tmp_path):
+def test_paths_of_a_controller_and_of_an_arm_follow_the_configuration(tmp_path):
     """The exact configuration lies in the folder of results: its paths are relative to that."""
     (tmp_path / "push.csv").write_text("t_s,c1_kPa,c2_kPa,c3_kPa\n0,0,0,0\n1,5,0,0\n")
     (tmp_path / "arm").mkdir()
-    drivers = DRIVER.format(name="push", what='schedule = "push.csv"') + DRIVER.format(
+    own = CONTROLLER.format(name="push", what='schedule = "push.csv"') + CONTROLLER.format(
         name="sweep", what="waypoints = [[0.0, 1.0, 1.0, 1.0], [2.5, 2.0, 2.0, 2.0]]"
     )
     case = '[[cases]]\nname = "mine"\narm = "arm"\n'
-    spec = load_experiment(write(tmp_path, TINY + drivers + case))
-    assert spec.drivers[0].schedule == str(tmp_path / "push.csv")
+    spec = load_experiment(write(tmp_path, TINY + own + case))
+    assert spec.controllers[0].schedule == str(tmp_path / "push.csv")
     assert spec.cases[0].arm == str(tmp_path / "arm")
-    assert [row[0] for row in spec.drivers[1].waypoints] == [0.0, 2.5]
+    assert [row[0] for row in spec.controllers[1].waypoints] == [0.0, 2.5]
     (tmp_path / "results").mkdir()
     save_experiment(spec, tmp_path / "results" / "experiment.toml")
     text = (tmp_path / "results" / "experiment.toml").read_text()
@@ -217,3 +219,23 @@ def test_fields_that_do_not_fit_each_other_are_named(said, tmp_path):
     with pytest.raises(InputError, match=re.escape(said)) as caught:
         load_experiment(path)
     assert "\n" not in str(caught.value)
+
+
+def test_files_with_former_names_open(tmp_path):
+    """`drivers`, `specimen` and `rig.specimen` have other names since, and mean the same."""
+    own = CONTROLLER.format(name="sweep", what="waypoints = [[0.0, 1.0, 1.0, 1.0]]")
+    case = '[[cases]]\nname = "a"\nplant = "rig"\nrobot_seed = 3\n'
+    vary = VARY.format(field="rig.robot_seed", values="4, 5")
+    present = load_experiment(write(tmp_path, TINY + own + case))
+    old = (own + case).replace("controllers", "drivers").replace("robot_seed", "specimen")
+    assert load_experiment(write(tmp_path, TINY + old)) == present
+    assert present.cases[0].robot_seed == 3
+    seeds = []
+    for text in (vary, vary.replace("rig.robot_seed", "rig.specimen")):
+        spec = load_experiment(write(tmp_path, TINY + case + text))
+        rigs = [rig_config(each, Where(tmp_path), ("laser",)) for each in settings(spec)]
+        seeds.append([rig.seed for rig in rigs])
+    assert seeds == [[4, 5], [4, 5]]
+    both = case + "specimen = 3\n"
+    with pytest.raises(InputError, match="got specimen and robot_seed; expected robot_seed alone"):
+        load_experiment(write(tmp_path, TINY + both))

@@ -16,7 +16,7 @@ from surgisoft.cli.progress import progress
 from surgisoft.files import write_atomically, write_json
 from surgisoft.progress import Progress
 
-app = typer.Typer(help="Long studies whose results are committed.", no_args_is_help=True)
+app = typer.Typer(help="Studies that compute the tables of docs/results.", no_args_is_help=True)
 
 Images = Annotated[Path | None, typer.Option(metavar="DIR", help="Write pictures to this folder.")]
 """Option of the studies with pictures."""
@@ -33,7 +33,7 @@ Work = Annotated[
     Path,
     typer.Option(
         metavar="DIR",
-        help="Folder of recordings, models and results in between; what is there is reused.",
+        help="Folder of intermediate recordings, models and results; existing ones are reused.",
     ),
 ]
 """Option of the studies that can be interrupted."""
@@ -181,7 +181,7 @@ def decision(
         list[str] | None,
         typer.Option(
             metavar="NAME=FOLDER...",
-            help="Cases that take no part in any fit: judged by the fit to all others.",
+            help="Cases that no fit uses: the fit to all other cases is tested on them.",
         ),
     ] = None,
     robots: Robots = "200,201,202,203,204,205",
@@ -208,7 +208,7 @@ def decision(
     ] = None,
     output: Output = None,
 ) -> None:
-    """Fit the decision of `diagnose` to cases of several sources, and judge each left out."""
+    """Fit the decision of `diagnose` to cases of several sources; test it on each, left out."""
     from benchmarks.decision import own_rig
     from benchmarks.decision.study import run
     from benchmarks.decision.table import markdown
@@ -244,7 +244,7 @@ def setup_faults(
     work: Work = Path("runs/benchmark-setup-faults"),
     output: Output = None,
 ) -> None:
-    """Faults of the set-up in recordings: frames, units, orders, chambers, clocks."""
+    """Benchmark of the set-up tests: wrong frames, units, orders, chambers and clocks."""
     from benchmarks.setup_faults import markdown, run
 
     numbers = _numbers("--robots", robots)
@@ -269,7 +269,7 @@ def hidden_effect(
     images: Images = None,
     output: Output = None,
 ) -> None:
-    """Train, diagnose on a rig with a hidden effect, amend, and train again."""
+    """Train a policy, diagnose the model on a rig with a hidden effect, amend it, and retrain."""
     import torch
 
     from benchmarks.hidden_effect.study import StudyConfig, run
@@ -334,14 +334,17 @@ def robust(
         str,
         typer.Option(
             help="Policies, with commas: runs' folders, names of packaged ones, or scripted; the "
-            "first is judged with hidden effects, too."
+            "first is evaluated with hidden effects, too."
         ),
     ] = "ring,scripted",
     robots: Annotated[
         str, typer.Option(help="Seeds of the robots, with commas; 0 to 20 served for development.")
     ] = "21,22,23,24,25,26,27,28,29,30",
     own: Annotated[
-        str, typer.Option(help="Those that a model is fitted to, too, with commas; may be empty.")
+        str,
+        typer.Option(
+            help="Robots that also get a model fitted to them, with commas; may be empty."
+        ),
     ] = "21,22,23,24,25,26,27,28,29,30",
     episodes: Annotated[int, typer.Option(min=1, help="Episodes of each robot.")] = 10,
     hidden_robots: Annotated[
@@ -377,7 +380,7 @@ def robust(
     output: Output = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Rings cut on robots that no model knows: each policy with either observer."""
+    """Rings cut on robots that no model was fitted to: each policy with each observer."""
     from dataclasses import asdict
 
     import torch
@@ -431,9 +434,7 @@ def robust(
     shown = ""
     if images:
         shown = f"\n![robust](../images/{draw(rows, floors, study, images).name})\n"
-    _show(
-        "Rings on robots that took no part", command, markdown(rows, floors, study) + shown, output
-    )
+    _show("Rings on unseen robots", command, markdown(rows, floors, study) + shown, output)
 
 
 @app.command()
@@ -486,7 +487,7 @@ def real(
     output: Output = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Known changes of real robots: a model fitted before, diagnosed after, beside the truth."""
+    """Known changes of real robots: diagnose a model that was fitted before the change."""
     from benchmarks.real.entries import data_folder, load_entries
     from benchmarks.real.study import run, to_json
     from benchmarks.real.table import markdown
@@ -579,7 +580,7 @@ def budget(
     ] = "1,64,1024,4096,16384",
     output: Output = None,
 ) -> None:
-    """What each part of a training step must cost on this machine, and what it costs."""
+    """Least possible and measured cost of each part of a training step on this machine."""
     from benchmarks.budget import markdown, run
     from surgisoft.tasks.registry import spec_of
 

@@ -2,7 +2,7 @@
 
 Every fault alone and in pairs, with random parameters, in recordings of several sources: the
 virtual rig, other rigs whose recordings and models lie in folders, and real robots. A fault is
-found if the verdict names its kinds and no other, and mending gives the original recording back:
+found if the verdict names its kinds and no other, and the correction restores the original:
 key points to the error of the model, actuation to 2 % of its range. False alarms are counted on
 clean recordings and on recordings with each hidden effect of the rig.
 """
@@ -35,7 +35,7 @@ AMPLITUDES = (1.0, 2.0)
 HIDDEN_ROWS = 6000
 """Rows of a recording with a hidden effect."""
 ACTUATION_SHARE = 0.02
-"""Largest RMS error of the mended actuation, as a share of its range."""
+"""Largest RMS error of the corrected actuation, as a share of its range."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,8 @@ class Outcome:
     """Whether the kinds are right, of the first explanation or of one that does as well."""
     first: bool
     """Whether the first explanation is right."""
-    mended: bool
-    """Whether mending gives the original recording."""
+    corrected: bool
+    """Whether the correction gives the original recording."""
     seconds: float
     """Processor time of the tests, s."""
     sentence: str
@@ -248,45 +248,45 @@ def run_case(source: Source, path: Path, truth: tuple[str, ...], seed: int) -> O
         found=found.kinds if found else (),
         named=named if truth else found is None,
         first=first if truth else found is None,
-        mended=first and bool(truth) and _gives_back(found, wrong, original, model),
+        corrected=first and bool(truth) and _gives_back(found, wrong, original, model),
         seconds=seconds,
         sentence=found.sentence if found else "",
     )
 
 
 def _gives_back(found: SetupResult, wrong: Recording, original: Recording, model) -> bool:
-    """Whether mending the wrong recording gives the original one."""
-    if not found.mendable:
+    """Whether correcting the wrong recording gives the original one."""
+    if not found.correctable:
         return True
-    mended = found.mended([wrong])[0]
+    corrected = found.corrected([wrong])[0]
     validated, noise = model.validation.rmse_mm or 0.0, original.noise_mm or 0.0
     limit = float(np.hypot(validated, np.sqrt(3.0) * noise))
-    delay = mended.t_s - _matching(mended, original)
+    delay = corrected.t_s - _matching(corrected, original)
     if np.ptp(delay) > 1e-6:
         return False
-    at = _matching(mended, original)
+    at = _matching(corrected, original)
     place = np.clip(np.searchsorted(original.t_s, at - 1e-6), 0, original.samples - 1)
-    apart = np.square(mended.key_points_mm - original.key_points_mm[place]).sum(2)
+    apart = np.square(corrected.key_points_mm - original.key_points_mm[place]).sum(2)
     moved = np.ptp(original.measured, axis=0).max()
-    driven = np.sqrt(np.mean(np.square(mended.measured - original.measured[place])))
+    driven = np.sqrt(np.mean(np.square(corrected.measured - original.measured[place])))
     dead = any(fault.kind == "dead_chamber" for fault in found.faults)
     share = 3 * ACTUATION_SHARE if dead else ACTUATION_SHARE  # the command is no measurement
     return bool(np.sqrt(np.nanmean(apart)) <= limit and driven <= share * moved)
 
 
-def _matching(mended: Recording, original: Recording) -> np.ndarray:
-    """(T,) time in the original of each mended row, by its key points' nearest whole offset."""
+def _matching(corrected: Recording, original: Recording) -> np.ndarray:
+    """(T,) time in the original of each corrected row, by its key points' nearest whole offset."""
     step = float(np.median(np.diff(original.t_s)))
     best, offset = np.inf, 0.0
     reach = round(2.0 / step)
     for rows in range(-reach, reach + 1):
-        at = np.searchsorted(original.t_s, mended.t_s + rows * step - 1e-6)
+        at = np.searchsorted(original.t_s, corrected.t_s + rows * step - 1e-6)
         if at.min() < 0 or at.max() >= original.samples:
             at = np.clip(at, 0, original.samples - 1)
-        apart = np.square(mended.key_points_mm - original.key_points_mm[at])
+        apart = np.square(corrected.key_points_mm - original.key_points_mm[at])
         if (error := float(np.nanmean(apart))) < best:
             best, offset = error, rows * step
-    return mended.t_s + offset
+    return corrected.t_s + offset
 
 
 # Sources --------------------------------------------------------------------------------------
@@ -380,13 +380,13 @@ def markdown(outcomes: list[Outcome]) -> str:
     for name in dict.fromkeys(o.source for o in outcomes):
         some = [o for o in outcomes if o.source == name]
         parts += [f"## {name}", "", _summary(some), "", _by_fault(some), ""]
-        wrong = [o for o in some if not o.named or (o.truth and o.first and not o.mended)]
+        wrong = [o for o in some if not o.named or (o.truth and o.first and not o.corrected)]
         if wrong:
             parts += ["What went wrong:", ""]
             parts += [
                 f"- {o.recording}, {' + '.join(o.truth) or 'no fault'}: "
                 f"{o.sentence or 'nothing was found'}"
-                + ("" if not o.named else " (not mended to within the error of the model)")
+                + ("" if not o.named else " (not corrected to within the error of the model)")
                 for o in wrong
             ]
             parts.append("")
@@ -399,7 +399,9 @@ def _summary(some: list[Outcome]) -> str:
         faulty = [o for o in some if len(o.truth) == count]
         rows.append(f"| {text}: named, alone or in a set | 99 % | {_share(faulty, 'named')} |")
         rows.append(f"| {text}: named first | | {_share(faulty, 'first')} |")
-        rows.append(f"| {text}: named first, and mended | 99 % | {_share(faulty, 'mended')} |")
+        rows.append(
+            f"| {text}: named first, and corrected | 99 % | {_share(faulty, 'corrected')} |"
+        )
     clean = [o for o in some if not o.truth and o.recording.startswith("clean")]
     hidden = [o for o in some if not o.truth and not o.recording.startswith("clean")]
     for text, group in (("clean", clean), ("a physical effect", hidden)):
@@ -420,12 +422,12 @@ def _share(some: list[Outcome], name: str) -> str:
 
 
 def _by_fault(some: list[Outcome]) -> str:
-    rows = ["| fault | alone: named, mended | in pairs: named, mended |", "|---|---|---|"]
+    rows = ["| fault | alone: named, corrected | in pairs: named, corrected |", "|---|---|---|"]
     for name in FAULTS:
         cells = []
         for count in (1, 2):
             group = [o for o in some if name in o.truth and len(o.truth) == count]
-            named, mended = sum(o.named for o in group), sum(o.mended for o in group)
-            cells.append(f"{named}, {mended} of {len(group)}")
+            named, corrected = sum(o.named for o in group), sum(o.corrected for o in group)
+            cells.append(f"{named}, {corrected} of {len(group)}")
         rows.append(f"| {name} | {cells[0]} | {cells[1]} |")
     return "\n".join(rows)

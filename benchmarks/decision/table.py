@@ -423,7 +423,7 @@ def markdown(cases: Sequence[Labelled], values: dict, aside: Sequence[Labelled] 
             own = [case for case in aside if case.source == name]
             if kin:
                 new[f"{name}, fitted without {kin}"] = judged(own, models[kin])
-        parts += ["## Robots that took no part in anything", goals(new)]
+        parts += ["## Unseen robots", goals(new)]
         for name, some in new.items():
             parts += [f"### What was said, {name}", kinds(some)]
     inside = robots_left_out(cases)

@@ -11,16 +11,16 @@ from surgisoft.report.charts import BLUE, GREEN, RED, drawing
 from surgisoft.report.style import MUTED
 
 FORMS = {
-    "line_lag": "The rig's tube and the model's line follow other laws of flow, and the model's "
-    "fitted best where the error is largest: in quick motion. The circle is slow motion, where "
-    "its lag is another one than the rig's."
+    "line_lag": "The rig's tube and the model's line have different laws of flow. The model's "
+    "parameters were fitted where the error is largest, which is in fast motion. On the circle, "
+    "which is slow motion, the model's lag differs from the rig's."
 }
-"""What is known of the two forms of an effect, the rig's and the model's."""
+"""How the form of an effect in the rig differs from its form in the model, where it matters."""
 COLOURS = {"before": RED, "after": GREEN, "oracle": BLUE}
 """Colours of the three models, in every picture."""
 WORDS = {
-    "blind": "without the cameras (`--no-cameras`): the model alone says where the body is",
-    "cameras": "with the cameras: key points are measured and filtered",
+    "blind": "without cameras (`--no-cameras`): only the model estimates the body's position",
+    "cameras": "with cameras, so that the state observer corrects the model by measured key points",
 }
 """Meaning of each kind of sight."""
 
@@ -38,29 +38,31 @@ def markdown(outcomes: list[Outcome], config: StudyConfig) -> str:
 
 def _setting(outcomes: list[Outcome], config: StudyConfig) -> str:
     names = [o.case for o in outcomes if CASES[o.case].hidden]
-    hidden = f" {', '.join(names)}: switched on in the rig at strength {config.strength:g} after "
-    hidden += "the model was fitted." if names else ""
-    own = " hysteresis: the friction that the arm has anyway; the model without it is HAW-NN on "
-    own += "pressure alone, its oracle HAW-NN fitted with the effect on the same settled points."
+    hidden = f" {', '.join(names)}: switched on in the rig with amplitude {config.strength:g} "
+    hidden += "after the model was fitted."
+    own = " hysteresis: the friction that every arm of the rig has. The model that lacks it is "
+    own += "HAW-NN on pressure alone; the oracle is HAW-NN fitted with the effect to the same "
+    own += "steady-state samples."
     return (
         f"Robot {config.robot_seed} of the virtual rig."
         + (hidden if names else "")
         + (own if any(not CASES[o.case].hidden for o in outcomes) else "")
-        + f" Diagnosed and amended on one `mixed` recording of {config.samples / 1200:g} minutes; "
-        "`after` is amended by what the diagnosis named first, whether that is right or not. "
-        "The oracle is given the effect's name and has three such recordings. All models are "
-        "evaluated on another `mixed` recording. "
+        + f" Each model is diagnosed and amended on one `mixed` recording of "
+        f"{config.samples / 1200:g} minutes. The model `after` has the effect that the diagnosis "
+        "named first, right or wrong. The oracle is given the name of the effect and three such "
+        "recordings. All models are evaluated on another `mixed` recording. "
         f"Policies: `{TASK}`, preset `fast`, {config.steps:,} steps each, seed {config.seed}; "
-        f"{config.episodes} episodes of each policy on the rig. The circle lies where the policy's "
-        "own model has the tip at 20 kPa, so each model has its own. One robot, one seed: "
-        "differences of a few hundredths of a millimetre between policies are not distinguished."
+        f"{config.episodes} episodes of each policy on the rig. The centre of the circle is the "
+        "tip's position at 20 kPa by the policy's own model, so it differs between models. With "
+        "one robot and one seed, differences of a few hundredths of a millimetre between policies "
+        "mean nothing."
     )
 
 
 def _models(outcomes: list[Outcome]) -> str:
     """Verdicts and errors of the models."""
     lines = [
-        "| hidden | verdict | put in | before | after | oracle | floor "
+        "| hidden | verdict | added | before | after | oracle | floor "
         "| fall after (95 %) | share of the oracle's fall |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
@@ -99,12 +101,11 @@ def _verdicts(outcomes: list[Outcome]) -> list[str]:
             pairs = ", ".join(" from ".join(pair) for pair in plan["separates"]) or "no pair surely"
             lines.append(
                 f"- next experiment: {plan['name']}, {plan['minutes']:g} minutes, expected to "
-                f"distinguish "
-                f"{pairs}; recorded on the rig"
+                f"distinguish {pairs}; recorded on the rig"
             )
             lines.append(f"- diagnose with it: {o.verdicts[-1]['verdict']['sentence']}")
             if o.verdicts[-1]["verdict"]["kind"] == "ambiguous":
-                lines.append("- still ambiguous: the first one is put in")
+                lines.append("- still ambiguous: the first of the two is added")
         lines.append(f"- amend: {o.claim}")
         for p in o.parameters:
             low, high = (values_text(end) for end in p["ci95"])
@@ -146,11 +147,11 @@ def _brought(outcomes: list[Outcome]) -> list[str]:
             before, after = (o.driven[f"{key}/learned/{sight}"] for key in ("before", "after"))
             change = 1.0 - after["mean"] / before["mean"]
             if after["high"] < before["low"]:
-                what = f"helps: {100 * change:.0f} % less error"
+                what = f"reduces the error by {100 * change:.0f} %"
             elif after["low"] > before["high"]:
-                what = f"harms: {-100 * change:.0f} % more error"
+                what = f"increases the error by {-100 * change:.0f} %"
             else:
-                what = f"does not help beyond chance ({-100 * change:+.0f} %)"
+                what = f"changes the error by {-100 * change:+.0f} %, which is not significant"
             lines.append(
                 f"- {o.case}, {'no cameras' if sight == 'blind' else 'cameras'}: retraining on the "
                 f"amended model {what} ({before['mean']:.3f} to {after['mean']:.3f} mm)"
@@ -165,8 +166,8 @@ def _why(outcomes: list[Outcome]) -> list[str]:
         if o.paced is None:
             continue
         lines = [
-            f"**Why {o.case} gets worse.** By how much the arm trails the model (negative: the "
-            "model trails the arm), and the model's error, on the test recording:",
+            f"**Why the error increases with {o.case}.** Delay of the arm relative to the model "
+            "(negative: the model is late) and the model's error, on the test recording:",
             "",
             "| fastest chamber, kPa/s | rows | " + " | ".join(f"{key}" for key in MODELS) + " |",
             "|---|---|" + "---|" * len(MODELS),
@@ -192,10 +193,11 @@ def _why(outcomes: list[Outcome]) -> list[str]:
             for p in o.paced["parameters"]
         )
         paragraphs.append(
-            "**Amended at the task's own pace.** The same effect, fitted to as long a recording of "
-            f"slow circles instead: {o.paced['claim']} ({values}). On the mixed test recording, "
-            f"which is quicker, this model is off by {o.paced['mixed_mm']:.3f} mm. Policy trained "
-            f"on it and script, on the rig: {'; '.join(cells)}."
+            "**Amended with motion as slow as the task's.** The same effect was fitted to an "
+            f"equally long recording of slow circles: {o.paced['claim']} ({values}). On the mixed "
+            f"test recording, which is faster, the error of this model is "
+            f"{o.paced['mixed_mm']:.3f} mm. Policy trained on this model and scripted expert, on "
+            f"the rig: {'; '.join(cells)}."
         )
     return paragraphs
 
@@ -205,8 +207,8 @@ def _costs(outcomes: list[Outcome]) -> str:
     cpu = sum(cost["cpu_s"] for cost in each) / len(each)
     wall = sum(cost["wall_s"] for cost in each) / len(each)
     return (
-        f"Training of a policy took {cpu:.0f} s of processor ({wall:.0f} s of wall time on shared "
-        "cores) on average. Effects that start from the same model share the policy before."
+        f"Training of a policy took {cpu:.0f} s of processor time ({wall:.0f} s of wall time on "
+        "shared cores) on average. Effects that start from the same model share the policy before."
     )
 
 

@@ -11,10 +11,11 @@ HEADER = (
     "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
 )
 ERRORS = (
-    "*error* is that of the given model, of the training rows of the recordings after the change. "
-    "*held out*, *amended* and *with the truth* are of the held-out quarter: without any effect, "
-    "with the named ones and with the true ones; where these were fitted together with the "
-    "network, *held out* is the network alone, trained for as many epochs."
+    "*error* is the error of the given model on the training rows of the recordings after the "
+    "change. *held out*, *amended* and *with the truth* are errors on the held-out quarter: "
+    "without an added effect, with the named effects and with the true ones. Where effects were "
+    "fitted together with the network, *held out* is the error of the network alone, trained "
+    "for as many epochs."
 )
 """What the columns of errors say."""
 NAMED_GOAL = 0.9
@@ -83,12 +84,13 @@ def summary(ran: Sequence[Outcome]) -> list[str]:
         "|---|---|---|",
         f"| known change named, alone or in a set of {MOST_NAMES} | "
         f"{sum(o.named for o in known)} of {len(known)} | {NAMED_GOAL:.0%} |",
-        f"| ... alone | {len(alone)} of {len(known)} | |",
-        f"| truth first in the ranking | {len(first)} of {len(known)} | |",
+        f"| known change named alone | {len(alone)} of {len(known)} | |",
+        f"| true effect first in the ranking | {len(first)} of {len(known)} | |",
         f"| wrong name with confidence >= {CLAIMED} | {sum(o.misled for o in ran)} of {len(ran)} "
         "| 0 |",
-        f"| named where nothing changed | {sum(_names(o) for o in called)} of {len(clean)} | 0 |",
-        f"| called unknown where nothing changed | "
+        f"| effect named where nothing changed | {sum(_names(o) for o in called)} of {len(clean)} "
+        "| 0 |",
+        f"| unknown effect reported where nothing changed | "
         f"{sum(not _names(o) for o in called)} of {len(clean)} | |",
     ]
 

@@ -22,7 +22,9 @@ def _studies() -> typer.Typer:
         from benchmarks.commands import app as studies
 
         return studies
-    absent = typer.Typer(help="Long studies; they need a checkout of the repository.")
+    absent = typer.Typer(
+        help="Studies that compute the tables of docs/results; they need a checkout."
+    )
 
     @absent.callback(
         invoke_without_command=True,

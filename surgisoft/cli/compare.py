@@ -65,8 +65,8 @@ def compare(
             "--error-scale",
             metavar="MM",
             min=1e-6,
-            help="Error at which the replay's colours end, mm; default: from the errors of the "
-            "worst model. Give the same for replays that are to be compared.",
+            help="Error at the end of the replay's colour scale, mm; default: from the errors of "
+            "the worst model. Give the same value for replays that are to be compared.",
         ),
     ] = None,
     credibility: Credibility = None,
@@ -74,15 +74,15 @@ def compare(
         bool,
         Option(
             "--test",
-            help="Refuse recordings that a model was fitted to, in whole or in part: the error is "
-            "then one on data that took no part.",
+            help="Refuse recordings that a model was fitted to, in whole or in part, so that the "
+            "error is a test error.",
         ),
     ] = False,
     effect_files: EffectFiles = None,
 ) -> None:
     """Compare arm models with measurements: the error, and what it depends on.
 
-    Several models before the recordings are shown together, with one scale of their errors.
+    Several models before the recordings are shown together on one error scale.
     """
     check_free(json_file, "rmse_mm")
     check_folder(report)
@@ -143,7 +143,7 @@ def compare(
         written.append(replay)
     print(result.sentence)
     if result.setup:
-        print(f"set-up: {result.setup}; `surgisoft diagnose` shows what mends it")
+        print(f"set-up: {result.setup}; `surgisoft diagnose` shows the correction")
     print(arm.summary())
     _show(result)
     for one in compared[1:]:

@@ -19,7 +19,7 @@ def demo(
 ) -> None:
     """Show what the package does: two arms cut a ring; a model's missing effect is found.
 
-    Needs no data. The page index.html in DIR is there after the first step and grows with each.
+    Needs no data. The page DIR/index.html exists after the first step; each step adds its result.
     """
     from surgisoft.demonstration import demo as run_demo
 

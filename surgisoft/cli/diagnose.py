@@ -83,9 +83,9 @@ def diagnose(
 ) -> None:
     """Diagnose a model: name the physical effect that it lacks, or report why none can be named.
 
-    The set-up of the recordings is tested first: a turned or mirrored frame, wrong units, swapped
-    chambers or key points, clocks that are apart, dead channels. Where one is found, the result is
-    'setup' with what mends it, and no effect is looked for.
+    The set-up of the recordings is tested first: a rotated or mirrored frame, wrong units, swapped
+    chambers or key points, a clock offset, dead channels. If a fault is found, the verdict is
+    'setup', with its correction, and no effect is sought.
 
     Uses the first three quarters of each recording; the last quarter is held out for `amend`.
     """
@@ -139,8 +139,8 @@ def diagnose(
         written.append(replay)
     elif replay:
         warn(f"{replay} was not written: no rows of the same actuation before and after")
-    if apply and found.setup and found.setup.mendable:
-        save_recordings(found.setup.mended(measured), apply)
+    if apply and found.setup and found.setup.correctable:
+        save_recordings(found.setup.corrected(measured), apply)
         written.append(apply)
     _show(found)
     show_written(written)
@@ -148,7 +148,7 @@ def diagnose(
     if found.setup:
         _next_after_setup(found.setup, model, data, apply)
     elif apply:
-        print(f"nothing to mend: {apply} was not written")
+        print(f"nothing to correct: {apply} was not written")
     if found.next_command:
         option = f" --before {' '.join(map(str, before))}" if before else ""
         command = found.next_command.format(model=model, data=data, before=option)
@@ -157,22 +157,23 @@ def diagnose(
 
 def _next_after_setup(setup, model: Path, data: str, apply: Path | None) -> None:
     """Print what to do about a fault of the set-up."""
-    if not setup.mendable:
+    if not setup.correctable:
         if apply:
-            print(f"{apply} was not written: that cannot be mended in the recordings")
-        print(f"next: {setup.mending.splitlines()[0]}")
+            print(f"{apply} was not written: this fault cannot be corrected in the recordings")
+        print(f"next: {setup.instructions.splitlines()[0]}")
     elif apply:
         print(f"next: {with_effect_files(f'surgisoft diagnose {model} {apply}')}")
     else:
-        print(f"next: {with_effect_files(f'surgisoft diagnose {model} {data} --apply MENDED')}")
+        print(f"next: {with_effect_files(f'surgisoft diagnose {model} {data} --apply CORRECTED')}")
 
 
 def _show_setup(setup) -> None:
-    """Print what mends the faults of a set-up."""
-    print(f"in: {', '.join(setup.recordings)}")
-    print("to mend it, in the map of `surgisoft import`:" if setup.mendable else "to mend it:")
-    print(textwrap.indent(setup.mending, "  "))
-    for other in setup.alternative_mendings:
+    """Print how to correct the faults of a set-up."""
+    print(f"recordings with this fault: {', '.join(setup.recordings)}")
+    where = ", in the map of `surgisoft import`" if setup.correctable else ""
+    print(f"to correct it{where}:")
+    print(textwrap.indent(setup.instructions, "  "))
+    for other in setup.alternative_instructions:
         print("or, for the other explanation:")
         print(textwrap.indent(other, "  "))
     if setup.how_to_tell:
@@ -215,7 +216,7 @@ def _show(found) -> None:
 def _show_refit(refit) -> None:
     """Print the candidates that were fitted together with the network."""
     print(f"fitted together with the network, because {refit.reason}:")
-    print(f"{'effect':18s} {'left of the network alone':>28s} {'difference, 95 %':>28s} {'p':>7s}")
+    print(f"{'effect':18s} {'RMSE, of network alone':>28s} {'difference, 95 %':>28s} {'p':>7s}")
     for row in refit.candidates:
         low, high = row.ci95_mm
         note = "" if row.plausible else "  implausible parameters"

@@ -96,8 +96,8 @@ def evaluate(
             "--rules",
             metavar="EXPERIMENT",
             help="Rules of an experiment (FILE.toml, or a packaged name such as liver): its scene, "
-            "fields of the task such as fire_mm, phases, limits and seed, so that episode k is its "
-            "episode k. Without it those of the training run, or of --config.",
+            "fields of the task such as fire_mm, phases, limits and seed, so that episode k is the "
+            "experiment's episode k. Default: those of the training run, or of --config.",
         ),
     ] = None,
     effect_files: EffectFiles = None,

@@ -38,8 +38,8 @@ def export(
         list[Path] | None,
         typer.Option(
             metavar="REC...",
-            help="Recordings over which the files of an arm model are compared with the model, row "
-            "by row; the largest difference is printed, and more than 1e-5 mm refused.",
+            help="Recordings over which the files of an arm model are compared with the model, "
+            "row by row; the largest difference is printed, and one above 1e-5 mm is an error.",
         ),
     ] = None,
     effect_files: EffectFiles = None,

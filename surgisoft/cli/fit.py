@@ -50,23 +50,24 @@ def fit(
         Literal["haw_nn", "kernel", "auto", "constant_curvature", "recurrent"],
         typer.Option(
             help="haw_nn: HAW-NN; kernel: arcs and kernel regression on the actuation and its low "
-            "passes, for few data; auto: haw_nn and kernel, of which held-out data choose one; "
-            "constant_curvature and recurrent: baselines."
+            "passes, for few data; auto: of haw_nn and kernel the one with the lower held-out "
+            "error; constant_curvature and recurrent: baselines."
         ),
     ] = "haw_nn",
     prior: Annotated[
         Literal["none", "arcs"],
         typer.Option(
-            help="Prior mean: a chain of arcs, fitted first; the network learns what is left. For "
-            "few data, and for motions that were only recorded one by one.",
+            help="Prior mean: a chain of arcs, fitted first; the network learns the remainder. For "
+            "few data, and for chambers that were only recorded one at a time.",
         ),
     ] = "none",
     members: Annotated[
         int,
         typer.Option(
             min=1,
-            help="Networks whose mean is the prediction: an ensemble, each member trained without "
-            "another share of the data. Lower error where data are few; slower to evaluate.",
+            help="Number of networks in an ensemble, whose mean is the prediction; each is trained "
+            "without a different part of the data. Lower error where data are few; slower to "
+            "evaluate.",
         ),
     ] = 1,
     widths: Annotated[
@@ -126,4 +127,4 @@ def fit(
         print(line)
     print(f"wrote {output}: {result.model.summary()}")
     following = with_effect_files(f"surgisoft compare {output} TEST.parquet --test --report PAGE")
-    print(f"next, its error on a recording that took no part: {following}")
+    print(f"next, its error on an unseen recording: {following}")

@@ -62,7 +62,7 @@ def import_(
 ) -> None:
     """Import a laboratory's files as recordings; a map states columns, units and frames.
 
-    Notes name what looks wrong: lengths, reversed key points, clocks that differ. With a
+    It reports what looks wrong: lengths, reversed key points, clocks that differ. With a
     model of the arm, frames, units, orders, chambers and dead channels are tested, too.
     """
     from surgisoft.measurement.importing import (
@@ -157,8 +157,8 @@ def _test_setup(arm: "ArmModel", name: str, recordings: list) -> None:
         print(f"set-up: no fault that {name} shows")
         return
     warn(f"set-up: {found.sentence}")
-    print("to mend it, in a map that reads the recording (docs/diagnosis.md, set-up faults):")
-    print(textwrap.indent(found.mending, "  "))
+    print("to correct it, in a map that reads the recording (docs/diagnosis.md, set-up faults):")
+    print(textwrap.indent(found.instructions, "  "))
 
 
 @app.command("recording")

@@ -48,7 +48,7 @@ def improve(
     effect_files: EffectFiles = None,
     force: Force = False,
 ) -> None:
-    """Improve a model: diagnose, amend, and again, until no further effect is significant.
+    """Improve a model: repeat diagnosis and amendment until no further effect is significant.
 
     The result is validated on the last quarter of each recording. Where no effect was added, or
     the error did not fall significantly, nothing is written (exit code 1).
@@ -108,7 +108,7 @@ def improve(
     known = result.model.fitted_rows
     test = "TEST.parquet --test" if known is not None and known.complete else "TEST.parquet"
     following = with_effect_files(f"surgisoft compare {model} {output} {test} --report PAGE")
-    print(f"next, both on a recording that took no part: {following}")
+    print(f"next, both models on an unseen recording: {following}")
 
 
 def _show(result) -> None:

@@ -133,7 +133,7 @@ def _show(
         options = f" {result.options}" if result.options else ""
         place = "" if rig == "virtual" else f" --rig {rig}"
         if result.by_hand:
-            print("  the virtual rig has no option for that change: --as-it-stands asks for none")
+            print("  the virtual rig has no option for that change: --as-it-stands proposes no change")
         elif not record:
             print(f"  on the virtual rig: surgisoft collect {output}{place}{options} -o {new}")
     # After a change that removes an effect, only the new recording counts.
@@ -178,7 +178,7 @@ def _record(result, rig: str, schedule: Path, record: Path, force: bool) -> None
     if result.by_hand or lacking:
         raise InputError(
             f"{schedule} is written, {record} is not: first {result.steps[0]}; then "
-            f"'surgisoft collect {schedule} --rig {rig} -o {record}' (--as-it-stands asks for no "
+            f"'surgisoft collect {schedule} --rig {rig} -o {record}' (--as-it-stands proposes no "
             "change of the experimental setup)"
         )
     try:

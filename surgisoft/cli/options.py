@@ -95,8 +95,8 @@ EffectFiles = Annotated[
         metavar="FILE.py|PACKAGE.MODULE:OBJECT...",
         callback=_register,
         help="Files of user-defined effects (docs/effects.md): those in the model, and further "
-        "candidates. Also the callable that the model was made from (docs/your_model.md). All are "
-        "run, so name only those that you trust.",
+        "candidates. Also the callable that the model was made from (docs/your_model.md). All of "
+        "them are executed, so name only files that you trust.",
     ),
 ]
 """Option of every command that opens a model. Reading the command line runs the code."""
@@ -185,7 +185,7 @@ Preflight = Annotated[
     bool,
     Option(
         "--preflight",
-        help="On a real rig: try each chamber alone first, and stop where the arm does not move as "
+        help="On a real rig: try each chamber alone first, and stop if the arm does not move as "
         "its model predicts.",
     ),
 ]
@@ -241,9 +241,9 @@ Refit = Annotated[
     Literal["auto", "never", "always"],
     Option(
         "--refit",
-        help="Fit candidate effects together with the network and let held-out runs decide: auto "
-        "where the error is far above the noise floor and no larger than the model's validated "
-        "error, as when a network imitates a lag. Takes minutes.",
+        help="Fit candidate effects together with the network; held-out runs decide. auto: only if "
+        "the error is far above the noise floor but no larger than the model's validated error, as "
+        "happens if the network has learned to imitate a lag. Takes minutes.",
     ),
 ]
 REFIT_PROCESSES = min(2, os.cpu_count() or 1)

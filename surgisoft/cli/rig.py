@@ -57,9 +57,10 @@ def check(
     ] = "default",
     effect_files: EffectFiles = None,
 ) -> None:
-    """Try each chamber of a rig alone, a little, and compare the motion with a model's prediction.
+    """Compare the motion of each chamber of a rig with a model's prediction.
 
-    It finds swapped tubes, chambers that do not move and a frame of the cameras that is turned.
+    Each chamber is pressurised slightly, one at a time. This finds swapped tubes, chambers
+    that do not move and a rotated camera frame.
     """
     check_model(Path(model))
     from surgisoft.rig import guarded, open_rig

@@ -336,12 +336,12 @@ def criteria_of(
 
     The comparison error counts with its uncertainty: the upper end of E ± U_val. fitted: whether
     the model was fitted to some of the rows; criteria on the error are then not met, because it is
-    known on no data that took no part.
+    known on no unseen data.
     """
     limits, found = context.limits, []
     measured = [each for each in points[:-1] if np.isfinite(each.error_mm)]
     unknown = float("nan")
-    why = ", on data that took no part in the fit" if fitted else ""
+    why = ", on unseen data" if fitted else ""
     if limits.error_mm is not None:
         worst = max(measured, key=lambda each: each.interval_mm[1])
         name = f"E + U_val of every key point (largest: {worst.label})"

@@ -1,4 +1,4 @@
-"""A demonstration in five steps: cut, measurement, error, its cause, and the mended model."""
+"""A demonstration in five steps: cut, measurement, error, its cause, and the corrected model."""
 
 from surgisoft.demonstration.story import Demonstration, demo
 

@@ -72,7 +72,7 @@ class Fall:
 
     @property
     def claimed(self) -> bool:
-        """Whether a fall on data that took no part is claimed: it is significant, and the old model
+        """Whether a fall on unseen data is claimed: it is significant, and the old model
         had been fitted to none of the rows."""
         return self.significant and not self.in_fit
 
@@ -100,7 +100,7 @@ class Fall:
         low = self.ci95[0]
         if self.in_fit and self.significant:
             return (
-                "no fall on data that took no part is claimed, because the model had been fitted "
+                "no fall on unseen data is claimed, because the model had been fitted "
                 f"to {self.in_fit:.0%} of the held-out rows: {self.numbers('there')}"
             )
         numbers = self.numbers(
@@ -190,7 +190,7 @@ class Amendment:
         A network that is trained on together with the effects does not see the held-out rows. If
         the given model had been fitted to some of them, its error there is no test, and what counts
         is the network that was trained on from the same weights for as long without the effects:
-        that comparison is claimed, and no error on data that took no part.
+        that comparison is claimed, and no error on unseen data.
         """
         if self._seen_before:
             return self.alone.significant
@@ -215,7 +215,7 @@ class Amendment:
             return f"{text}, its network's last layer re-tuned" if self.retuned else text
         if not self.retuned:
             return text
-        return f"{text}; {self.held_out.after:.3f} mm with the network's last layer re-tuned behind"
+        return f"{text}; {self.held_out.after:.3f} mm with the network's last layer re-tuned"
 
     @property
     def _together(self) -> str:
@@ -227,8 +227,8 @@ class Amendment:
                 f"{head} {self.alone.numbers(where)}, fitted together with the network, compared "
                 "with the network alone, trained for as many epochs from the same weights; the "
                 f"given model, which had been fitted to {self.held_out.in_fit:.0%} of these rows, "
-                f"has {self.held_out.before:.3f} mm there, so none of these is an error on data "
-                "that took no part"
+                f"has {self.held_out.before:.3f} mm there, so none of these errors is on unseen "
+                "data"
             )
         network = (
             f"the network alone, trained for as many epochs, reaches {self.alone.before:.3f} mm"

@@ -227,7 +227,7 @@ def compare(
     from before a change; the comparison then also says how far the two sets differ (`pairs`), by
     the paired difference where both have the same actuation; paired: as for `diagnose`.
     test: raise InputError where the model was fitted to some of the recordings, or keeps no record
-    of its fit, so that the error is one on data that took no part.
+    of its fit, so that the error is a test error.
     """
     model, recordings, before = open_model(model, recordings, before, predictions, error_mm)
     model, recordings, notes = open_inputs(model, recordings, sized=False)

@@ -83,14 +83,14 @@ FITTED_STAGES = ("line", "material")
 MOST_FITTED = 3
 """Most effects that a fit is recommended with; `fit` takes those that lower its held-out error."""
 REASONS = {
-    "network": "a function of the actuation alone explains most of the error, more than the "
-    "model's validated error allows: the model does not describe this arm as it is, fit one to "
-    "these recordings",
+    "network": "a function of the actuation alone explains most of the error, which is larger than "
+    "the model's validated error, so the model does not describe this arm: fit a model to these "
+    "recordings",
     "learned": "the error is no larger than the model's validated error, and a black box with "
-    "memory explains part of it that no static function does: the model was fitted to what is "
-    "missing and has learned part of it, fit one together with effects",
-    "few_data": "the recordings show too few different motions",
-    "schedule": "several causes explain these recordings about as well, and none well enough",
+    "memory explains a part of it that no static function explains, so the network has learned "
+    "part of the missing effect: fit a network together with effects",
+    "few_data": "the recordings contain too few different motions",
+    "schedule": "several causes explain these recordings about equally well, and none well enough",
 }
 """Why a diagnosis cannot tell, in words."""
 
@@ -196,7 +196,7 @@ class Diagnosis:
     """Calibrated probabilities of what is true."""
     next_command: str = ""
     """What to do, as a command with `{model}`, `{data}` and `{before}` (the option with recordings
-    from before, or nothing) in the place of the files; empty where nothing is to be done."""
+    from before, or nothing) for the files; empty where nothing is to be done."""
     setup: SetupResult | None = None
     """What is wrong with the set-up of the recordings; None where no fault is proved."""
     change: Change | None = None
@@ -261,7 +261,7 @@ def diagnose(
 
     Model and recordings may be given by their paths; a model of other origin as for `compare`.
     Where `setup_tests` prove a fault of the set-up, the verdict is `setup`, and no effect is
-    looked for: `Diagnosis.setup` mends the recordings.
+    looked for: `Diagnosis.setup` corrects the recordings.
 
     Only the training rows are looked at: the key points of all others are removed first (`Sealed`).
     before: recordings from before a change in question. Where they were made with the same
@@ -466,7 +466,9 @@ def result_of(found: Findings, decision: Decision | None = None) -> Diagnosis:
     sentence = sentence_of(decision, levels, _reached(found, effects, kind), where)
     others = _instead(evidence) if kind == "several" else ()
     if others:
-        sentence += f"; {' or '.join(others)} would do as well in the place of one of them"
+        sentence += (
+            f"; {' or '.join(others)} explains the recordings about as well as one of the two"
+        )
     if kind == "unknown_effect":
         sentence += knock(evidence)
     plan = recommend(problem, effects).experiment if kind == "ambiguous" else None
@@ -500,9 +502,9 @@ def would_explain(found: Findings, decision: Decision) -> list[str]:
     if chance < WORTH_TELLING or found.selection.in_fit(best.effect):
         return []
     text = (
-        f"{best.effect} would explain {100 * best.gain:.0f} % of what can be explained of the "
-        f"error, but the error is no larger than the model's validated error, so that an error of "
-        f"the fit explains it as well"
+        f"{best.effect} would explain {100 * best.gain:.0f} % of the explainable error, but the "
+        f"error is no larger than the model's validated error, so an error of the fit explains it "
+        f"as well"
     )
     if known_effects()[best.effect].stage in ("line", "material"):
         text += f"; fit the network together with it (fit --effects {best.effect}) and compare"
@@ -522,14 +524,14 @@ def amplitudes_that_vary(evidence: Evidence, decision: Decision) -> list[str]:
     found = [(name, own.get(name) or 0.0) for name in decision.effects]
     return [
         f"the amplitude of {name} differs between motions by {100 * math.sqrt(value):.0f} %, and "
-        f"what is missing has one amplitude: something else, or a second effect, may be behind it"
+        f"a missing effect has one amplitude: another effect, or a second one, may be the cause"
         for name, value in found
         if value >= VARIES
     ]
 
 
 def _instead(evidence: Evidence) -> tuple[str, ...]:
-    """Effects that would do about as well in the place of one of two."""
+    """Effects that explain the recordings about as well as one of two."""
     pair = next((each for each in evidence.proposals if len(each.effects) == 2), None)
     if pair is None:
         return ()
@@ -623,20 +625,20 @@ def sentence_of(
     if kind == "unknown_effect":
         near = next(iter(decision.probabilities.effects), None)
         return (
-            f"something is missing and it is none of the known effects (confidence {sure:.2f}; "
-            f"{f'{near} is nearest' if near else 'none is near'}); {error}"
+            f"the missing effect is none of the known ones (confidence {sure:.2f}; "
+            f"{f'nearest: {near}' if near else 'none is near'}); {error}"
         )
     if kind == "surrogate_undertrained":
-        why = "its validated error says so too: it needs a longer fit, more data or a better form"
+        why = "its validated error is as large; it needs a longer fit, more data or a better form"
         if decision.reason:
             why = REASONS[decision.reason]
-        head = f"the model itself is off (confidence {sure:.2f}), look for no effects yet"
+        head = f"the model itself is off (confidence {sure:.2f}), so no effect is sought yet"
         return f"{head}: {why}; {error}"
     if kind == "cannot_tell":
         why, most = REASONS[decision.reason or "schedule"], _most_probable(decision)
         most = f" (most probable: {most})" if most else ""
         return f"cannot tell what is missing, if anything: {why}{most}; {error}"
-    return f"nothing is missing that these recordings could show; {error}"
+    return f"these recordings show no missing effect; {error}"
 
 
 def _most_probable(decision: Decision) -> str:

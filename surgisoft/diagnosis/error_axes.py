@@ -285,7 +285,7 @@ class Profile:
 
 @dataclass(frozen=True)
 class AxisShare:
-    """How much of the squared error an axis explains on blocks that took no part."""
+    """How much of the squared error an axis explains on held-out blocks."""
 
     axis: str
     """Name of the axis."""

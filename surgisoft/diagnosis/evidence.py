@@ -116,7 +116,7 @@ class ProposalEvidence:
     """Log of what the proposal with one effect less leaves over what this one leaves, the noise
     added to both."""
     instead: tuple[str, ...] = ()
-    """The best other effects in the place of the first and of the second of two."""
+    """The best substitutes for the first and for the second of two effects."""
     instead_left: tuple[float, ...] = ()
     """Log of what is left with it over what the two leave, the noise added to both."""
     instead_margin: tuple[float, ...] = ()
@@ -196,7 +196,7 @@ class Evidence:
 
 
 def _with_tuples(values: dict[str, Any]) -> dict[str, Any]:
-    """The values with tuples in the place of JSON's lists."""
+    """The values with tuples instead of JSON's lists."""
     return {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
 
 

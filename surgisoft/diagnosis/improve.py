@@ -50,7 +50,7 @@ class Round:
     step: str | None
     """The effect that was added or fitted anew, or `network`; None where the loop ended."""
     rivals: tuple[str, ...]
-    """Effects that would do as well in its place."""
+    """Effects that would fit about as well."""
     confidence: float | None
     """Confidence in it, 0 to 1."""
     error_open_mm: float
@@ -117,7 +117,7 @@ class Improvement:
             where = f"on rows of which the given model had been fitted to {fall.in_fit:.0%}"
             return (
                 f"{names}: error {fall.numbers(where)}, fitted together with the network; none of "
-                "these is an error on data that took no part"
+                "these errors is on unseen data"
             )
         return f"{names}: {fall.sentence}"
 

@@ -77,7 +77,7 @@ def refuse_rows_of_fit(model: ArmModel, recordings: Iterable[Recording]) -> None
     if model.fitted_rows is None or not model.fitted_rows.complete:
         raise InputError(
             "the model keeps no record of all rows that it was fitted to, expected one that does "
-            "for a test: whether the recordings took no part cannot be shown; leave out --test"
+            "for a test: whether the model has seen the recordings is not known; leave out --test"
         )
 
 

@@ -203,12 +203,12 @@ class Change:
         names = " + ".join(self.before)
         if self.change_mm is None:
             return (
-                f"no common actuation with {names}: compared through the model, less what it got "
-                "wrong there"
+                f"no actuation in common with {names}: the model's residuals are compared with its "
+                "residuals there"
             )
         delays = sorted({f"{each.delay_s:.2f} s" for each in self.stretches[:DELAYS_SHOWN]})
         return (
-            f"{100 * self.paired_share:.0f} % of the rows have a partner in {names} (delay "
+            f"{100 * self.paired_share:.0f} % of the rows are paired with {names} (delay "
             f"{', '.join(delays)}); change {self.change_mm:.3g} mm, repeatability "
             f"{self.repeatability_mm:.3g} mm (from {self.repeatability_source})"
         )
@@ -988,8 +988,8 @@ class BeforeAfter:
         share = float(self.pairs.paired[~self.table.held_out].mean())
         return (
             f"{100 * share:.0f} % of the rows were recorded with the same actuation as "
-            f"{self.names}: compared through the model, less what can be learned of its error; "
-            "record the same protocol before and after",
+            f"{self.names}: the model's residuals before and after are compared instead; record "
+            "the same protocol before and after",
         )
 
 

@@ -208,9 +208,9 @@ class Refit:
             return text
         others = " and ".join(self.competing)
         if not self.of_line:
-            return f"{text}; {others} would do about as well"
+            return f"{text}; {others} would fit about as well"
         return (
-            f"{text}; {others} would do about as well, but the model's input is a command, which "
+            f"{text}; {others} would fit about as well, but the model's input is a command, which "
             "has to pass the line: measure the actuation to tell them apart"
         )
 
@@ -264,8 +264,8 @@ def reason_to_refit(problem: Problem) -> str:
 
 LINE: Stage = "line"
 """Stage between a command and the pressure of a chamber. A first-order lag of the pressure and one
-of the wall are the same operator on the actuation: where both do as well and the model's input is a
-command, which has passed a line in any case, the lag is that of the line."""
+of the wall are the same operator on the actuation: where both fit as well and the model's input is
+a command, which has passed a line in any case, the lag is that of the line."""
 
 
 def _of_line(effect: str) -> bool:

@@ -485,7 +485,7 @@ class Problem:
     def in_fit(self) -> float | None:
         """Share 0..1 of the part's rows that the model was fitted to; None where it does not say.
 
-        Errors on rows of the fit are no errors on data that took no part in it.
+        Errors on rows of the fit are no test errors.
         """
         known = self.model.fitted_rows
         return None if known is None else known.certain_part_of(self.history)

@@ -715,7 +715,7 @@ class _Session:
                 self.on_warning(
                     f"{recording.name}: the model was fitted to {100 * share:.0f} % of its rows, "
                     "and its error is smaller there than in the run: false alarms may come more "
-                    "often than stated; give a recording that took no part in the fit by --before"
+                    "often than stated; give an unseen recording by --before"
                 )
         runs = [run for recording in before for run in residual_runs(self.model, recording)]
         span = np.array(self.model.spec.span)

@@ -186,13 +186,15 @@ def test_the_tables_tell_help_from_chance_and_harm():
     text = markdown(some, StudyConfig())
     assert "| creep | identified: creep (0.97) -> identified: creep (0.97) | creep |" in text
     assert "| 0.300 (0.200 to 0.400) | 75 % |" in text  # (0.5 - 0.2) / (0.5 - 0.1)
-    assert "creep, no cameras: retraining on the amended model helps: 50 % less error" in text
-    assert "payload, cameras: retraining on the amended model does not help beyond chance" in text
-    assert "line_lag, cameras: retraining on the amended model harms: 50 % more error" in text
-    assert "took 2 s of processor (4 s of wall time" in text
-    assert "**Why line_lag gets worse.**" in text
-    assert "Why payload" not in text
-    assert "off by 0.310 mm" in text
+    assert "creep, no cameras: retraining on the amended model reduces the error by 50 %" in text
+    assert (
+        "payload, cameras: retraining on the amended model changes the error by -5 %, whi" in text
+    )
+    assert "line_lag, cameras: retraining on the amended model increases the error by 50 %" in text
+    assert "took 2 s of processor time (4 s of wall time" in text
+    assert "**Why the error increases with line_lag.**" in text
+    assert "with payload.**" not in text
+    assert "the error of this model is 0.310 mm" in text
     assert "scripted 0.120 (0.110 to 0.130) mm without cameras." in text
     assert "| 1 to 3 | 9 | +0.100 s, 0.200 mm |" in text
     assert "- creep tau_s: 0.156 s (0.14 to 0.173)" in text

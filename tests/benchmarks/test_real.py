@@ -184,10 +184,10 @@ def test_what_counts_as_named_and_as_misled():
     assert [each.misled for each in some] == [False, False, False, True] + 4 * [False] + [True]
     rows = summary(some)
     assert "| known change named, alone or in a set of 2 | 2 of 5 | 90% |" in rows
-    assert "| ... alone | 1 of 5 | |" in rows
+    assert "| known change named alone | 1 of 5 | |" in rows
     assert "| wrong name with confidence >= 0.8 | 2 of 9 | 0 |" in rows
     assert "| named where nothing changed | 2 of 4 | 0 |" in rows
-    assert "| called unknown where nothing changed | 1 of 4 | |" in rows
+    assert "| unknown effect reported where nothing changed | 1 of 4 | |" in rows
 
 
 def test_faults_of_the_set_up_have_to_be_those_that_are_true():

@@ -69,7 +69,7 @@ def test_compare_prints_what_is_known_and_says_what_is_not(bench, capsys, monkey
         time_shift=SimpleNamespace(seconds=0.1, ci95_s=(0.05, 0.15)), explainable=0.5,
     )  # fmt: skip
     out = printed(capsys, monkeypatch, target, [one], "compare", "default", rec)
-    assert "set-up: chambers 1 and 2 are swapped; `surgisoft diagnose` shows what mends it" in out
+    assert "set-up: chambers 1 and 2 are swapped; `surgisoft diagnose` shows the correction" in out
     assert "RMSE 0.5000 mm, tip not measured, noise floor unknown, 20 samples, 3 rows" in out
     assert "key points base to tip: 0.2500 - mm" in out
     assert "the model states no prediction interval" in out
@@ -123,8 +123,9 @@ def test_evaluate_prints_a_column_for_each_policy(capsys, monkeypatch):
 
 def found_setup(**fields) -> SimpleNamespace:
     values = {
-        "mendable": False, "recordings": ("bench",), "mending": "turn the tracker\nby a quarter",
-        "alternative_mendings": (), "how_to_tell": "", "mended": lambda some: some,
+        "correctable": False, "recordings": ("bench",),
+        "instructions": "turn the tracker\nby a quarter",
+        "alternative_instructions": (), "how_to_tell": "", "corrected": lambda some: some,
     }  # fmt: skip
     return SimpleNamespace(**(values | fields))
 
@@ -142,26 +143,26 @@ def diagnosis(**fields) -> SimpleNamespace:
 
 def test_diagnose_prints_what_mends_a_set_up(bench, tmp_path, capsys, monkeypatch):
     target, rec = "surgisoft.diagnosis.diagnose.diagnose", str(bench / "bench.parquet")
-    new = tmp_path / "mended"
-    both = found_setup(alternative_mendings=("swap two tubes",), how_to_tell="shake chamber 1")
+    new = tmp_path / "corrected"
+    both = found_setup(alternative_instructions=("swap two tubes",), how_to_tell="shake chamber 1")
     command = ["diagnose", "default", rec]
     found = diagnosis(setup=both)
     out = printed(capsys, monkeypatch, target, found, *command, "--apply", str(new))
-    assert "to mend it:\n  turn the tracker\n  by a quarter\nor, for the other expl" in out
+    assert "to correct it:\n  turn the tracker\n  by a quarter\nor, for the other expl" in out
     assert "other explanation:\n  swap two tubes\nshake chamber 1\n1.5 s\n" in out
-    assert f"{new} was not written: that cannot be mended in the recordings" in out
+    assert f"{new} was not written: this fault cannot be corrected in the recordings" in out
     assert out.endswith("next: turn the tracker\n")
     assert not new.exists()
-    found = diagnosis(setup=found_setup(mendable=True))
+    found = diagnosis(setup=found_setup(correctable=True))
     out = printed(capsys, monkeypatch, target, found, *command)
-    assert "to mend it, in the map of `surgisoft import`:" in out
-    assert out.endswith(f"next: surgisoft diagnose default {rec} --apply MENDED\n")
+    assert "to correct it, in the map of `surgisoft import`:" in out
+    assert out.endswith(f"next: surgisoft diagnose default {rec} --apply CORRECTED\n")
     out = printed(capsys, monkeypatch, target, found, *command, "--apply", str(new))
     assert out.endswith(f"next: surgisoft diagnose default {new}\n")
     assert [path.name for path in new.glob("*.parquet")] == ["bench.parquet"]
     none = diagnosis(verdict=SimpleNamespace(kind="nothing_missing", sentence="fits"))
     out = printed(capsys, monkeypatch, target, none, *command, "--apply", str(tmp_path / "x"))
-    assert out.endswith(f"nothing to mend: {tmp_path / 'x'} was not written\n")
+    assert out.endswith(f"nothing to correct: {tmp_path / 'x'} was not written\n")
     before = ["--before", rec, "--replay", str(tmp_path / "a.rrd")]
     monkeypatch.setattr(target, lambda *_, **__: none)
     assert run([*command, *before]) == 0
@@ -493,7 +494,7 @@ def test_what_is_claimed_is_written_with_its_page(bench, tmp_path, capsys, monke
     )  # fmt: skip
     assert "What default lacks on bench" in out
     assert "the error falls\n" in out
-    assert f"wrote {new}: an arm\nnext, both on a recording that took no part: surg" in out
+    assert f"wrote {new}: an arm\nnext, both models on an unseen recording: surg" in out
     assert saved == [new]
     Path(numbers).unlink()
     out = printed(
@@ -550,7 +551,7 @@ def test_an_experiment_that_takes_something_away_is_told_by_hand(
     }  # fmt: skip
     monkeypatch.setattr("surgisoft.cli.next_experiment.warn_all", lambda notes: None)
     for by_hand, said in (
-        (True, "  the virtual rig has no option for that change: --as-it-stands asks for none\n"),
+        (True, "  the virtual rig has no option for that change: --as-it-stands proposes no change\n"),
         (False, f"  on the virtual rig: surgisoft collect {new} --payload 5 -o NEW.parquet\n"),
     ):
         plan = result(**(fields | {"by_hand": by_hand}))

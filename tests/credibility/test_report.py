@@ -124,7 +124,7 @@ def test_no_validation_is_claimed_on_recordings_of_the_fit(tmp_path):
     assert [each.passed for each in criteria_of(context, points, None)] == [True] * 3
     criteria = criteria_of(context, points, None, fitted=True)
     assert [each.passed for each in criteria] == [False] * 3
-    assert "on data that took no part in the fit" in criteria[0].name
+    assert "on unseen data" in criteria[0].name
     about = dict.fromkeys(field.name for field in dataclasses.fields(Assessment))
     seen = Comparator("a", "", "", "", "", "continuous", 9, 1.0, (), 0.4)
     about |= {"points": points, "criteria": criteria, "comparators": (seen,)}

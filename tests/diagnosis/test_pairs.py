@@ -234,7 +234,7 @@ def test_no_common_motion_is_a_note_and_an_error_if_pairs_are_asked_for(model):
     after, before = made(smooth_walk(10), 0.0), made(smooth_walk(11), 0.0, seed=2, name="other")
     found = diagnose(model, [after], before=[before])
     assert found.change.change_mm is None
-    assert any("compared through the model" in note for note in found.notes)
+    assert any("residuals before and after are compared" in note for note in found.notes)
     with pytest.raises(InputError, match="same actuation as other"):
         diagnose(model, [after], before=[before], paired="always")
     with pytest.raises(InputError, match="pairing"):

@@ -136,11 +136,11 @@ def test_amend_claims_no_fall_on_rows_of_the_fit(model, seen, sure, other, tmp_p
     assert not sure.claimed
     assert replace(sure, in_fit=0.0).claimed
     assert sure.sentence.startswith(
-        "no fall on data that took no part is claimed, because the model had been fitted to 100%"
+        "no fall on unseen data is claimed, because the model had been fitted to 100%"
     )
     assert seen.to_json()["error_mm"]["took_no_part"] is False
     page = write_page(amend_page(seen, "t", "a"), tmp_path / "page.html").read_text()
-    assert "they are no data that took no part" in page
+    assert "they are not unseen data" in page
     new = amend(model, [other], "gain_mismatch", False, refit="never")
     assert new.to_json()["error_mm"]["took_no_part"] is True
     assert replace(sure, in_fit=new.alone.in_fit).sentence.startswith("error ")
@@ -150,10 +150,10 @@ def test_improve_claims_it_where_the_network_was_trained_together(model, sure):
     step = Round("identified", "", "creep", (), 0.9, 1.0, 1.0)
     found = Improvement(model, (step,), (), sure, (None, None), 0.0)
     assert not found.claimed
-    assert "no fall on data that took no part is claimed" in found.sentence
+    assert "no fall on unseen data is claimed" in found.sentence
     together = replace(found, rounds=(replace(step, together=True),))
     assert together.claimed
-    assert "none of these is an error on data that took no part" in together.sentence
+    assert "none of these errors is on unseen data" in together.sentence
     assert "held-out" not in together.sentence
 
 
@@ -167,7 +167,7 @@ def test_diagnose_calls_no_row_of_the_fit_held_out(arm, known, other, tmp_path, 
     assert "held-out" in new.left_out
     assert "held-out" not in seen.verdict.sentence + seen.left_out
     page = write_page(diagnosis_page(seen, "t"), tmp_path / "page.html").read_text()
-    assert "no error on this page is one on data that took no part" in page
+    assert "no error on this page is an error on data" in page
     assert run(["diagnose", str(arm), str(tmp_path / "known.parquet"), "--refit", "never"]) == 0
     shown = capsys.readouterr().out
     assert "held-out" not in shown

@@ -42,11 +42,11 @@ HOW = (
     "recordings do not determine: the prediction was validated, not the number."
 )
 HOW_IN_FIT = (
-    "The given model had been fitted to {:.0%} of the held-out rows. They took no part in the fit "
-    "of the effects, but they are no data that took no part: the given model's error there is "
-    "smaller than on new recordings, and intervals of parameters do not know what its network has "
-    "taken of the effects. `surgisoft compare MODEL NEW REC --test` compares both models on "
-    "recordings that neither was fitted to."
+    "The given model had been fitted to {:.0%} of the held-out rows. The effects were not fitted "
+    "to these rows, but they are not unseen data: the given model's error there is smaller than on "
+    "new recordings, and the intervals of the parameters do not include the part of the effects "
+    "that its network has learned. `surgisoft compare MODEL NEW REC --test` compares both models "
+    "on recordings that neither was fitted to."
 )
 POINTS = 600
 """Points of a line in a chart."""

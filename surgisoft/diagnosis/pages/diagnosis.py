@@ -29,14 +29,14 @@ HOW = (
     "model on it."
 )
 HOW_IN_FIT = (
-    "The model was fitted to {:.0%} of the rows that were looked at. So blocks of time are left "
-    "out of the fit of the effects alone, and no error on this page is one on data that took no "
-    "part in the model's fit."
+    "The model was fitted to {:.0%} of the rows of this diagnosis. Blocks of time are left out of "
+    "the fit of the effects only, so no error on this page is an error on data that the model has "
+    "not seen."
 )
 HOW_SETUP = (
     "Frames, units, orders, chambers, clocks and dead channels are tested before any effect. A "
     "fault is named where the model, with the fault corrected, predicts held-out blocks of time "
-    "about as well as a right set-up would. No effect was looked for: mend the recordings first, "
+    "about as well as a right set-up would. No effect was sought: correct the recordings first, "
     "with the lines in the map of `surgisoft import` or with `surgisoft diagnose ... --apply DIR`."
 )
 TONES = {"identified": "good", "several": "good", "nothing_missing": "good"}
@@ -199,19 +199,19 @@ def worst_stretch(track: ChangeTrack) -> np.ndarray:
 
 
 def _setup(setup: SetupResult) -> Section:
-    """What is wrong with the set-up, and what mends it."""
+    """What is wrong with the set-up, and its correction."""
     rows = [
         (fault.kind.replace("_", " "), fault.sentence, _numbers(fault)) for fault in setup.faults
     ]
     parts: list[Part] = [
         Table(["fault", "what was found", "numbers"], rows),
         Text(f"Recordings: {', '.join(setup.recordings)}."),
-        Text("What mends it:"),
-        Command(setup.mending),
+        Text("Correction:"),
+        Command(setup.instructions),
     ]
-    for other, mending in zip(setup.alternatives, setup.alternative_mendings, strict=True):
+    for other, instructions in zip(setup.alternatives, setup.alternative_instructions, strict=True):
         what = "; ".join(fault.sentence for fault in other)
-        parts += [Text(f"As likely: {what}. What mends that:"), Command(mending)]
+        parts += [Text(f"Equally likely: {what}. Correction:"), Command(instructions)]
     if setup.how_to_tell:
         parts.append(Text(setup.how_to_tell[:1].upper() + setup.how_to_tell[1:] + "."))
     return Section("Set-up of the recordings", parts)

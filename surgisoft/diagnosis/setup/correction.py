@@ -14,8 +14,8 @@ from surgisoft.measurement.recordings.columns import MM_PER
 from surgisoft.measurement.recordings.quality import without_frozen
 
 LEAST_ALIKE = 0.05
-"""By how much better a mended command must follow the mended measurement than the one as recorded,
-as a difference of correlations, to be mended too."""
+"""Least gain of the correlation with the corrected measurement for which a command is corrected
+too [-]."""
 ROUNDED = 6
 """Digits behind the point of a rotation in a map."""
 
@@ -50,7 +50,7 @@ class Correction:
     """Whether a channel is frozen in some rows: these are left out."""
 
     def applied(self, recording: Recording) -> Recording:
-        """The mended recording; rows that a shifted clock does not reach are left out."""
+        """The corrected recording; rows that a shifted clock does not reach are left out."""
         if self.stale:
             lost = frozen_points(recording)
             lost[:, [k for k in range(recording.key_points) if k not in self.stale]] = False
@@ -63,16 +63,16 @@ class Correction:
             if commanded is None:
                 raise InputError(
                     f"{recording.label}: no commanded actuation (columns c1_{recording.unit} ...), "
-                    "expected one in the place of a dead channel; record again"
+                    "expected one to replace a dead channel; record again"
                 )
             measured = measured.copy()
             measured[:, list(self.from_command)] = commanded[:, list(self.from_command)]
-        mended = self.arrangement.of(measured)
+        corrected = self.arrangement.of(measured)
         if commanded is not None:
-            commanded = self._commanded(commanded, mended)
+            commanded = self._commanded(commanded, corrected)
         fresh = replace(
             recording,
-            measured=mended,
+            measured=corrected,
             commanded=commanded,
             key_points_mm=self._points(recording.key_points_mm),
             unit=self.unit,
@@ -80,12 +80,12 @@ class Correction:
         )
         return self._on_time(fresh) if self.delay_s else fresh
 
-    def _commanded(self, commanded: np.ndarray, mended: np.ndarray) -> np.ndarray:
-        """The command mended like the measurement where it then follows it better."""
+    def _commanded(self, commanded: np.ndarray, corrected: np.ndarray) -> np.ndarray:
+        """The command corrected like the measurement where it then follows it better."""
         like = self.arrangement.of(commanded)
-        better = _correlation(like, mended) - _correlation(commanded, mended)
-        same_unit = self.arrangement.factor != 1.0 and np.ptp(commanded) < np.ptp(mended) / 2
-        too_large = self.arrangement.factor < 1.0 and np.ptp(commanded) > 2 * np.ptp(mended)
+        better = _correlation(like, corrected) - _correlation(commanded, corrected)
+        same_unit = self.arrangement.factor != 1.0 and np.ptp(commanded) < np.ptp(corrected) / 2
+        too_large = self.arrangement.factor < 1.0 and np.ptp(commanded) > 2 * np.ptp(corrected)
         return like if better > LEAST_ALIKE or same_unit or too_large else commanded
 
     def _points(self, points: np.ndarray) -> np.ndarray:
@@ -119,7 +119,7 @@ class Correction:
         return _rows(whole, keep)
 
     def tables(self, commanded: bool = True) -> dict[str, dict[str, Any]]:
-        """Fields of a map by which `import` mends the recording as it reads it.
+        """Fields of a map by which `import` corrects the recording as it reads it.
 
         commanded: whether the recording has a command.
         """

@@ -1,4 +1,4 @@
-"""The set-up tests of a diagnosis: what is wrong before any physics, and what mends it."""
+"""The set-up tests of a diagnosis: faults that are no physics, and how to correct them."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -50,10 +50,10 @@ class SetupResult:
     """Other explanations that do as well, each with the faults that it consists of."""
     sentence: str
     """What is wrong, and what the correction does to the error."""
-    mending: str
-    """Lines of the import's map that mend it, or what else to do."""
-    alternative_mendings: tuple[str, ...]
-    """Lines of the import's map that mend it, or what else to do, by each alternative."""
+    instructions: str
+    """Lines of the import's map that correct it, or what else to do."""
+    alternative_instructions: tuple[str, ...]
+    """The same for each of the alternatives."""
     how_to_tell: str
     """How to find out which explanation is right; empty where there is one."""
     before_mm: float
@@ -64,18 +64,18 @@ class SetupResult:
     """Noise floor, mm."""
     recordings: tuple[str, ...]
     """Names of the recordings that it holds for."""
-    mendable: bool
-    """Whether the recordings can be mended without recording again."""
+    correctable: bool
+    """Whether the recordings can be corrected without recording again."""
     correction: Correction
-    """What mends a recording."""
+    """The correction of a recording."""
 
     @property
     def kinds(self) -> tuple[str, ...]:
         """The kinds of the faults."""
         return tuple(fault.kind for fault in self.faults)
 
-    def mended(self, recordings: Sequence[Recording]) -> list[Recording]:
-        """The recordings, those that the faults hold for mended."""
+    def corrected(self, recordings: Sequence[Recording]) -> list[Recording]:
+        """The recordings; those that have the faults are corrected."""
         return [
             self.correction.applied(recording) if recording.name in self.recordings else recording
             for recording in recordings
@@ -87,14 +87,14 @@ class SetupResult:
             "faults": [asdict(fault) for fault in self.faults],
             "alternatives": [[asdict(fault) for fault in some] for some in self.alternatives],
             "sentence": self.sentence,
-            "mending": self.mending,
-            "alternative_mendings": list(self.alternative_mendings),
+            "instructions": self.instructions,
+            "alternative_instructions": list(self.alternative_instructions),
             "how_to_tell": self.how_to_tell,
             "before_mm": self.before_mm,
             "after_mm": self.after_mm,
             "floor_mm": self.floor_mm,
             "recordings": list(self.recordings),
-            "mendable": self.mendable,
+            "correctable": self.correctable,
         }
 
 
@@ -199,16 +199,16 @@ class _Report:
         )
         others = [(o, self._exact(o)) for o in (self.found.as_good if self.found else ())]
         alternatives = tuple(tuple(self._faults(o, f)) for o, f in others)
-        mending, mendable = self._mending(correction)
+        instructions, correctable = self._instructions(correction)
         text = "; or ".join(joined(some) for some in (faults, *alternatives))
-        if mendable:
-            text += f": mended, the error falls from {before:.3g} to {after:.3g} mm"
+        if correctable:
+            text += f": the correction reduces the error from {before:.3g} to {after:.3g} mm"
         return SetupResult(
             faults=tuple(faults),
             alternatives=alternatives,
             sentence=text,
-            mending=mending,
-            alternative_mendings=tuple(
+            instructions=instructions,
+            alternative_instructions=tuple(
                 self._correction(o.hypothesis, f).lines(self._commands) for o, f in others
             ),
             how_to_tell=_how_to_tell(faults, alternatives),
@@ -216,7 +216,7 @@ class _Report:
             after_mm=after,
             floor_mm=self.search.levels.noise,
             recordings=tuple(recording.name for recording in self.recordings),
-            mendable=mendable,
+            correctable=correctable,
             correction=correction,
         )
 
@@ -273,8 +273,8 @@ class _Report:
             delay_s=-given.later_s,
         )
 
-    def _mending(self, correction: Correction) -> tuple[str, bool]:
-        """What mends the set-up, and whether that is possible without recording again."""
+    def _instructions(self, correction: Correction) -> tuple[str, bool]:
+        """How to correct the set-up, and whether that is possible without recording again."""
         lines = correction.lines(self._commands)
         still = [k for k, sign in enumerate(correction.arrangement.sign) if sign == 0.0]
         again = ""

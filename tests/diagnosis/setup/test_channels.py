@@ -28,7 +28,7 @@ def test_a_dead_channel_is_mended_by_its_command(model):
     found = find_setup_faults(model, [wrong])
     assert found.kinds == ("dead_chamber",)
     assert found.faults[0].numbers["channel"] == 2
-    np.testing.assert_array_equal(found.mended([wrong])[0].measured, original.measured)
+    np.testing.assert_array_equal(found.corrected([wrong])[0].measured, original.measured)
 
 
 @pytest.mark.parametrize("vector", [(0.0, 0.0, 0.0), (0.4, -0.8, 1.0)])
@@ -37,7 +37,7 @@ def test_a_dead_channel_without_a_command_shows_in_the_body(model, vector):
     found = find_setup_faults(model, [without_channel(original, 2, commanded=False)])
     assert found.kinds[0] == "dead_chamber"
     assert ("frame" in found.kinds) == any(vector)
-    assert not found.mendable
+    assert not found.correctable
     low, high = np.quantile(original.measured[:, 2], [0.05, 0.95])
     assert found.faults[0].numbers["range"] == pytest.approx([low, high], abs=4.0)
 
@@ -62,9 +62,11 @@ def test_a_dead_key_point_becomes_missing(model):
     found = find_setup_faults(model, [wrong])
     assert found.kinds == ("dead_key_point",)
     assert "k3" in found.sentence
-    mended = found.mended([wrong])[0].key_points_mm
-    assert np.isnan(mended[:, 3]).all()
-    np.testing.assert_array_equal(mended[:, [0, 1, 2, 4]], original.key_points_mm[:, [0, 1, 2, 4]])
+    corrected = found.corrected([wrong])[0].key_points_mm
+    assert np.isnan(corrected[:, 3]).all()
+    np.testing.assert_array_equal(
+        corrected[:, [0, 1, 2, 4]], original.key_points_mm[:, [0, 1, 2, 4]]
+    )
 
 
 def test_a_key_point_frozen_for_a_while_is_missing_there(model):
@@ -74,7 +76,7 @@ def test_a_key_point_frozen_for_a_while_is_missing_there(model):
     wrong = with_points(original, points)
     found = find_setup_faults(model, [wrong])
     assert found.kinds == ("dead_key_point",)
-    lost = np.isnan(found.mended([wrong])[0].key_points_mm[:, 4, 0])
+    lost = np.isnan(found.corrected([wrong])[0].key_points_mm[:, 4, 0])
     assert lost[601:1100].all()
     assert not lost[:600].any()
     assert not lost[1100:].any()
@@ -99,4 +101,4 @@ def test_a_chamber_that_does_not_act(model):
     found = find_setup_faults(model, [with_points(logged, true + noise)])
     assert found.kinds == ("chambers",)
     assert "chamber 1 does not act" in found.sentence
-    assert not found.mendable
+    assert not found.correctable

@@ -1,4 +1,4 @@
-"""Faults of a set-up that were put into recordings are named, mended, and told from physics."""
+"""Faults of a set-up that were put into recordings are named, corrected, and told from physics."""
 
 from dataclasses import replace
 
@@ -93,12 +93,12 @@ def test_one_fault_is_named_and_mended(model, name):
     assert found.kinds == (kind,)
     assert words in found.sentence.replace("-0.0", "0.0")
     assert found.alternatives == ()
-    mended = found.mended([wrong])[0]
-    assert find_setup_faults(model, [mended]) is None
+    corrected = found.corrected([wrong])[0]
+    assert find_setup_faults(model, [corrected]) is None
     if kind != "time":
-        apart = mended.key_points_mm - original.key_points_mm
+        apart = corrected.key_points_mm - original.key_points_mm
         assert np.sqrt(np.square(apart).sum(2).mean()) < 0.05
-        np.testing.assert_allclose(mended.measured, original.measured, atol=1e-9)
+        np.testing.assert_allclose(corrected.measured, original.measured, atol=1e-9)
 
 
 def test_without_noise_a_rotation_is_exact(model):
@@ -135,7 +135,7 @@ def test_two_faults_are_both_named(model, pair):
         wrong = SINGLE[name][0](wrong)
     found = find_setup_faults(model, [wrong])
     assert sorted(found.kinds) == sorted(SINGLE[name][1] for name in pair)
-    assert find_setup_faults(model, found.mended([wrong])) is None
+    assert find_setup_faults(model, found.corrected([wrong])) is None
 
 
 def lagged(recording, tau_s: float):
@@ -171,9 +171,9 @@ def test_one_of_two_recordings_with_a_turned_frame(model):
     found = find_setup_faults(model, [right, wrong])
     assert found.recordings == ("moved",)
     assert found.kinds == ("frame",)
-    same, mended = found.mended([right, wrong])
+    same, corrected = found.corrected([right, wrong])
     assert same is right
-    assert find_setup_faults(model, [same, mended]) is None
+    assert find_setup_faults(model, [same, corrected]) is None
 
 
 def test_a_diagnosis_ends_with_the_set_up(model):

@@ -1,4 +1,4 @@
-"""What mends a set-up: the lines of a map, `--apply`, and what the commands say."""
+"""The correction of a set-up: the lines of a map, `--apply`, and what the commands say."""
 
 import json
 from dataclasses import replace
@@ -48,7 +48,7 @@ def map_of(recording) -> dict:
 def test_the_lines_of_the_map_mend_like_apply(name, tmp_path):
     wrong = WRONG[name](measured())
     found = find_setup_faults(default_arm(), [wrong])
-    assert found.mendable
+    assert found.correctable
     save_recording(wrong, tmp_path / "raw.parquet")
     table = map_of(wrong)
     for section, fields in found.correction.tables().items():
@@ -60,11 +60,13 @@ def test_the_lines_of_the_map_mend_like_apply(name, tmp_path):
         columns = [f"p{k}_kPa" for k in (1, 2, 3)]
         table["measured"]["columns"] = columns
         table.pop("commanded")
-    (tmp_path / "mend.toml").write_text(tomli_w.dumps(table))
-    part = import_files([tmp_path / "raw.parquet"], load_map(str(tmp_path / "mend.toml")), None)[0]
-    mended = found.mended([wrong])[0]
-    np.testing.assert_allclose(part.recording.measured, mended.measured, atol=5e-3)
-    np.testing.assert_allclose(part.recording.key_points_mm, mended.key_points_mm, atol=2e-2)
+    (tmp_path / "correction.toml").write_text(tomli_w.dumps(table))
+    part = import_files(
+        [tmp_path / "raw.parquet"], load_map(str(tmp_path / "correction.toml")), None
+    )[0]
+    corrected = found.corrected([wrong])[0]
+    np.testing.assert_allclose(part.recording.measured, corrected.measured, atol=5e-3)
+    np.testing.assert_allclose(part.recording.key_points_mm, corrected.key_points_mm, atol=2e-2)
     assert find_setup_faults(default_arm(), [part.recording]) is None
 
 
@@ -78,7 +80,7 @@ def folder(tmp_path):
 
 def test_apply_writes_what_is_mended_and_nothing_else(folder, capsys):
     before = (folder / "day2.parquet").read_bytes()
-    out = folder / "mended"
+    out = folder / "corrected"
     given = ["diagnose", "default", str(folder / "day2.parquet"), "--apply", str(out)]
     assert run([*given, "--json", str(folder / "found.json")]) == 0
     text = capsys.readouterr().out
@@ -87,8 +89,8 @@ def test_apply_writes_what_is_mended_and_nothing_else(folder, capsys):
     assert f"next: surgisoft diagnose default {out}" in text
     assert (folder / "day2.parquet").read_bytes() == before
     assert sorted(path.name for path in out.iterdir()) == ["day2.parquet", "day2.toml"]
-    mended = load_recording(out / "day2.parquet")
-    apart = mended.key_points_mm - measured().key_points_mm
+    corrected = load_recording(out / "day2.parquet")
+    apart = corrected.key_points_mm - measured().key_points_mm
     assert np.abs(apart).max() < 0.1
     plain = json.loads((folder / "found.json").read_text())
     assert plain["verdict"]["kind"] == "setup"
@@ -104,9 +106,9 @@ def test_apply_replaces_nothing(folder, capsys):
 
 
 def test_nothing_is_written_where_nothing_is_wrong(folder, capsys):
-    out = folder / "mended"
+    out = folder / "corrected"
     assert run(["diagnose", "default", str(folder / "day1.parquet"), "--apply", str(out)]) == 0
-    assert "nothing to mend" in capsys.readouterr().out
+    assert "nothing to correct" in capsys.readouterr().out
     assert not out.exists()
 
 

@@ -133,7 +133,9 @@ def _show(
         options = f" {result.options}" if result.options else ""
         place = "" if rig == "virtual" else f" --rig {rig}"
         if result.by_hand:
-            print("  the virtual rig has no option for that change: --as-it-stands proposes no change")
+            print(
+                "  the virtual rig has no option for that change: --as-it-stands proposes no change"
+            )
         elif not record:
             print(f"  on the virtual rig: surgisoft collect {output}{place}{options} -o {new}")
     # After a change that removes an effect, only the new recording counts.

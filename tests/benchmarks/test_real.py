@@ -186,7 +186,7 @@ def test_what_counts_as_named_and_as_misled():
     assert "| known change named, alone or in a set of 2 | 2 of 5 | 90% |" in rows
     assert "| known change named alone | 1 of 5 | |" in rows
     assert "| wrong name with confidence >= 0.8 | 2 of 9 | 0 |" in rows
-    assert "| named where nothing changed | 2 of 4 | 0 |" in rows
+    assert "| effect named where nothing changed | 2 of 4 | 0 |" in rows
     assert "| unknown effect reported where nothing changed | 1 of 4 | |" in rows
 
 

@@ -551,7 +551,10 @@ def test_an_experiment_that_takes_something_away_is_told_by_hand(
     }  # fmt: skip
     monkeypatch.setattr("surgisoft.cli.next_experiment.warn_all", lambda notes: None)
     for by_hand, said in (
-        (True, "  the virtual rig has no option for that change: --as-it-stands proposes no change\n"),
+        (
+            True,
+            "  the virtual rig has no option for that change: --as-it-stands proposes no change\n",
+        ),
         (False, f"  on the virtual rig: surgisoft collect {new} --payload 5 -o NEW.parquet\n"),
     ):
         plan = result(**(fields | {"by_hand": by_hand}))

@@ -145,7 +145,7 @@ def test_a_correction_needs_what_it_takes():
     """The command in the place of a dead channel, and runs that are longer than the offset."""
     base = {"arrangement": PLAIN, "points": (0, 1, 2), "unit": "kPa", "recorded_unit": "kPa"}
     given = some()
-    assert "no commanded actuation (columns c1_kPa ...), expected one in the place of a" in refusal(
+    assert "no commanded actuation (columns c1_kPa ...), expected one to replace a d" in refusal(
         lambda: Correction(**base, from_command=(1,)).applied(given)
     )
     driven = replace(given, commanded=given.measured + 1.0)

@@ -131,7 +131,8 @@ def test_sample_by_sample_is_the_cusum_of_the_block_means(detector):
         rho = (1 - w.memory.white) * kept
         sd = w.level_mm * detector.enlargement
         level, fast = (now / sd) ** 2, (now - rho * before) ** 2 / sd**2 / (1 - rho**2)
-        squares, worth = np.concatenate([level, fast, fast]), (1 - kept**2) / (1 + kept**2)
+        squares = np.concatenate([level, fast, fast / w.fast])
+        worth = (1 - kept**2) / (1 + kept**2)
         count = np.concatenate([worth, np.ones(9), worth >= 0.5])
         ratio = (0.5 * squares * (1 - design.scale**-2) - np.log(design.scale)) * count
         charts = np.maximum(0.0, charts + np.minimum(np.minimum(ratio, h / 4), count * h / 3))
@@ -187,6 +188,48 @@ def test_heavy_tails_of_the_reference_enlarge_the_scale():
     for begin in range(200, len(t_s), 1500):
         jerky[begin : begin + 100] *= 8.0
     assert fit_detector([(t_s, jerky)]).enlargement > fit_detector([(t_s, values)]).enlargement
+
+
+def jumps(seconds, seed, factor):
+    """A slow circle with a jump each 20 s, and an error with 0.4 half ranges of memory along the
+    path, whose innovations are `factor` times as large in the jumps; four samples a second."""
+    rng = np.random.default_rng(seed)
+    t_s = np.arange(round(4.0 * seconds)) / 4.0
+    jumping = t_s % 20.0 >= 19.0
+    ways = np.repeat(rng.choice([-5.0, 5.0], len(t_s) // 80 + 1), 80)[: len(t_s)]
+    actuation = waves(np.cumsum(np.where(jumping, ways, 0.2) / 4.0))
+    path = np.linalg.norm(np.diff(actuation / (SPAN / 2), axis=0, prepend=actuation[:1]), axis=1)
+    keep = np.exp(-path / 0.4)
+    size = 0.1 * np.sqrt(1.0 - keep**2) * np.where(jumping, factor, 1.0)
+    steps, error = size[:, None, None] * rng.normal(size=(len(t_s), N, 3)), np.zeros((N, 3))
+    errors = np.empty_like(steps)
+    for j, step in enumerate(steps):
+        errors[j] = error = keep[j] * error + step
+    return Stretch(t_s, errors + 0.02 * rng.normal(size=errors.shape), actuation)
+
+
+def test_fast_moves_have_a_variance_of_their_own():
+    """A model that errs three times as much in fast moves as its memory along the path states.
+
+    Ten minutes hold 30 of them, and two hours raise no alarm; larger errors in them do.
+    """
+    found, plain = (fit([jumps(600, 20, factor)], SPAN) for factor in (3.0, 1.0))
+    assert np.median(found.whitening.fast) > 3.0 * np.median(plain.whitening.fast)
+    clean, changed = jumps(7200, 21, 3.0), jumps(600, 22, 12.0)
+    for stretch, alarms in ((clean, False), (changed, True)):
+        charts = Charts(found)
+        for each in zip(*stretch, strict=True):
+            charts.update(*each)
+        assert charts.judged > len(stretch.t_s) // 3, "of one block for two samples"
+        assert bool(charts.alarms) == alarms
+
+
+def test_fast_moves_that_the_reference_lacks_raise_no_chart(detector):
+    """The waves have one speed: a component for which it is slow has no fast move at all."""
+    w = detector.whitening
+    worth = w.memory.worth(np.linalg.norm(10.0 / (SPAN / 2)) / 2**0.5 * 0.5)
+    assert (worth < 0.4).any()
+    assert np.isinf(w.fast[worth < 0.4]).all()
 
 
 def test_a_short_reference_is_refused():

@@ -27,7 +27,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.stats import binomtest
+from scipy.stats import beta, binomtest
 
 import surgisoft
 from benchmarks.cache import digest
@@ -386,13 +386,30 @@ def coverage(outcomes: list[Outcome]) -> tuple[int, int]:
     return sum(holds), len(holds)
 
 
-def coverage_interval(outcomes: list[Outcome], draws: int = 2000) -> tuple[float, float]:
-    """95 % interval of the share that hold, recordings drawn with replacement (Efron 1979): the
-    quantities of one recording err together."""
-    pairs = np.array([coverage([outcome]) for outcome in outcomes], float)
-    picks = np.random.default_rng(0).integers(len(pairs), size=(draws, len(pairs)))
-    sums = pairs[picks].sum(1)
-    low, high = np.percentile(sums[:, 0] / sums[:, 1], [2.5, 97.5])
+def coverage_interval(outcomes: list[Outcome]) -> tuple[float, float]:
+    """95 % interval of the share of intervals that hold (Korn & Graubard 1998).
+
+    Quantities that err together are one cluster: those of one recording, and, where the network is
+    the robot's own, those of all recordings of a robot, because its error is the same in all of
+    them. The variance between clusters says how many independent values the share has, and the
+    interval of a binomial share (Clopper & Pearson 1934) is taken for that number. Where every
+    interval holds, or none does, the clusters show no variance, and their number is taken.
+    """
+    clusters: dict[object, list[Outcome]] = {}
+    for number, outcome in enumerate(outcomes):
+        setting = outcome.case.setting
+        own_network = setting.law == "rig" and not setting.bent_mm
+        key = (setting.name, outcome.case.robot) if own_network else number
+        clusters.setdefault(key, []).append(outcome)
+    good, count = np.array([coverage(some) for some in clusters.values()], float).T
+    share, number = good.sum() / count.sum(), len(clusters)
+    values = float(number)
+    if 0.0 < share < 1.0 and number > 1:
+        spread = number / (number - 1) * np.square(good - share * count).sum() / count.sum() ** 2
+        values = float(np.clip(share * (1.0 - share) / max(spread, 1e-12), number, count.sum()))
+    hold = share * values
+    low = beta.ppf(0.025, hold, values - hold + 1.0) if share > 0.0 else 0.0
+    high = beta.ppf(0.975, hold + 1.0, values - hold) if share < 1.0 else 1.0
     return float(low), float(high)
 
 

@@ -1,12 +1,20 @@
-"""Rotations and quaternions as raw files and maps write them."""
+"""Rotations and quaternions as raw files and maps write them.
+
+`scipy.spatial` is imported where a quaternion is read: its import takes longer than most files do.
+"""
+
+from __future__ import annotations
 
 import re
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from surgisoft.config import Where, describe
 from surgisoft.errors import InputError
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 _TOLERANCE = 1e-3
 """How far a matrix or quaternion of a map may be from a rotation; it is made exact within it."""
@@ -62,6 +70,8 @@ def _known(quaternions: np.ndarray) -> np.ndarray:
 
 
 def _rotations(quaternions: np.ndarray, order: str) -> Rotation:
+    from scipy.spatial.transform import Rotation
+
     return Rotation.from_quat(quaternions, scalar_first=order == "wxyz")
 
 
@@ -96,6 +106,8 @@ def between(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndar
     The sign of a result is free. NaN where a quaternion is missing; a share of 0 or 1 gives the
     given quaternion as it is.
     """
+    from scipy.spatial.transform import Rotation
+
     found = np.full(first.shape, np.nan)
     known = _known(first) & _known(second)
     if known.any():

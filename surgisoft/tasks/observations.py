@@ -6,7 +6,7 @@ the top of the task's file; `surgisoft.tasks.describe` lists them with their ind
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -61,6 +61,16 @@ def asinh(values: Tensor) -> Tensor:
     size = values.abs().clamp(max=LARGEST)
     square = size * size
     return torch.copysign(torch.log1p(size + square / (1.0 + (1.0 + square).sqrt())), values)
+
+
+def asinh_of(values: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    """`asinh` of each of several tensors of one shape (B, k), in one pass over all of them.
+
+    A single environment has few values, and its time goes into the number of operations.
+    """
+    if torch.jit.is_tracing() or torch.compiler.is_compiling():
+        return tuple(value.asinh() for value in values)
+    return asinh(torch.cat([*values])).chunk(len(values))
 
 
 def numbered(block: Block, values: Iterable[Tensor], unit: str = "step") -> ObservationBlocks:

@@ -16,7 +16,7 @@ from surgisoft.tasks.inverse_kinematics import action_towards
 from surgisoft.tasks.observations import (
     Block,
     ObservationBlocks,
-    asinh,
+    asinh_of,
     joined,
     numbered,
     pressure_blocks,
@@ -227,15 +227,21 @@ class Follow:
         """
         part, history = state.world.arms["arm"], state.goal.history
         point = self.marker(part.steered_mm)
-        errors = [self.target_mm(state, ahead) - point for ahead in range(self.config.preview + 1)]
+        preview = self.config.preview
+        targets = [self.target_mm(state, ahead) for ahead in range(max(preview, 1) + 1)]
+        errors = [target - point for target in targets[: preview + 1]]
+        close = errors[:2]
+        if self.config.one_step_prediction:
+            close = [*close, targets[1] - self.marker(self._held(part))]
+        scaled = asinh_of([*errors, *(error / self.config.fine_mm for error in close)])
+        wide, fine = scaled[: len(errors)], scaled[len(errors) :]
         blocks = {
             SHAPE: (part.steered_mm - self._rest)[:, 1:].flatten(1) / 10.0,
-            **numbered(ERROR, [asinh(error) for error in errors]),
-            **numbered(FINE, [asinh(error / self.config.fine_mm) for error in errors[:2]]),
+            **numbered(ERROR, wide),
+            **numbered(FINE, fine[: len(errors[:2])]),
         }
         if self.config.one_step_prediction:
-            predicted = self.target_mm(state, 1) - self.marker(self._held(part))
-            blocks[PREDICTED] = asinh(predicted / self.config.fine_mm)
+            blocks[PREDICTED] = fine[-1]
         blocks |= pressure_blocks(self.arm, part)
         blocks[PRESSURE_HISTORY] = history.kPa.flatten(1)
         blocks[POINT_HISTORY] = history.mm.flatten(1)

@@ -9,7 +9,7 @@ import torch
 from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.camera import seen_from
 from surgisoft.tasks.base import Episodes
-from surgisoft.tasks.observations import OBSERVATION_LIMIT, asinh
+from surgisoft.tasks.observations import OBSERVATION_LIMIT, asinh, asinh_of
 from surgisoft.tasks.registry import TASKS, make_task
 from surgisoft.tasks.world.scene import ENDOSCOPE, SceneEngine
 
@@ -105,3 +105,9 @@ def test_asinh_of_observations_keeps_its_digits():
     assert torch.allclose(found[known].double(), truth[known], rtol=2e-7, atol=0.0)
     assert (found[~known].abs() > OBSERVATION_LIMIT).all()
     assert asinh(x)[-1].isnan()
+
+
+def test_asinh_of_several_tensors_is_that_of_each():
+    values = [size * torch.randn(37, 3) for size in (1.0, 30.0, 1e-3)]
+    for value, found in zip(values, asinh_of(values), strict=True):
+        assert torch.equal(found, asinh(value))

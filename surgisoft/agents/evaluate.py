@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 import torch
-from scipy.stats import binomtest
+from scipy.special import ndtri
 from torch import Tensor
 
 from surgisoft.agents.exact_checks import EpisodeCheck, ExactChecks, contacts_in, has_obstacles
@@ -168,11 +168,23 @@ def summary(values: np.ndarray, rate: bool = False) -> Summary:
     if not len(known):
         return Summary(*(math.nan,) * 5, 0)
     if rate:
-        low, high = binomtest(round(known.sum()), len(known)).proportion_ci(CONFIDENCE, "wilson")
+        low, high = wilson(round(known.sum()), len(known))
     else:
         low, high = bootstrap(known)
     ends = (float(known.min()), float(known.max()))
     return Summary(float(known.mean()), float(low), float(high), *ends, len(known))
+
+
+def wilson(hits: int, count: int) -> tuple[float, float]:
+    """Ends of the 95 % interval of a rate, of which `count` trials gave a number of hits.
+
+    Wilson 1927, the score interval without correction for continuity. Its two ends are written
+    here because the import of `scipy.stats`, which has them, takes half a second.
+    """
+    z, rate = float(ndtri((1.0 + CONFIDENCE) / 2.0)), hits / count
+    middle = (2.0 * hits + z**2) / (2.0 * (count + z**2))
+    half = z / (2.0 * (count + z**2)) * math.sqrt(4.0 * count * rate * (1.0 - rate) + z**2)
+    return 0.0 if not hits else middle - half, 1.0 if hits == count else middle + half
 
 
 def bootstrap(values: np.ndarray) -> tuple[float, float]:

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.stats import binomtest
 
-from surgisoft.agents.evaluate import bootstrap, episode_table, summary
+from surgisoft.agents.evaluate import bootstrap, episode_table, summary, wilson
 from surgisoft.agents.exact_checks import Contact, EpisodeCheck
 from surgisoft.agents.rollout import Rollout
 from surgisoft.agents.session import EvaluationRequest, evaluate
@@ -28,6 +29,14 @@ def test_interval_of_a_rate_as_in_tables(hits, count, low, high):
     """Newcombe 1998, table I (method 3): Wilson's interval."""
     found = summary(np.repeat([1.0, 0.0], [hits, count - hits]), rate=True)
     assert (found.low, found.high) == pytest.approx((low, high), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("hits", "count"), [(0, 1), (1, 1), (0, 20), (7, 20), (20, 20), (996, 1000)]
+)
+def test_interval_of_a_rate_as_scipy_has_it(hits, count):
+    expected = binomtest(hits, count).proportion_ci(0.95, "wilson")
+    assert wilson(hits, count) == pytest.approx(tuple(expected), abs=1e-14)
 
 
 def test_bootstrap_interval_holds_the_mean_as_often_as_it_says():

@@ -26,11 +26,12 @@ apart.
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import Module, Parameter
 
 from surgisoft.diagnosis.residuals import Problem
 from surgisoft.surrogate.chain import Taps, context_of, memory_at
@@ -57,6 +58,10 @@ DAMPING_RATIOS = (0.1, 0.2, 0.4, 0.8)
 """Damping ratios of that mode that are tried: up to nearly no swing."""
 SAMPLES_A_PERIOD = 4.0
 """Fewest samples in a period of a mode that is tried."""
+
+
+Part = TypeVar("Part", bound=Module)
+"""An effect, or a module inside one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,9 +104,21 @@ class Candidate:
         return effect
 
 
-def copied(effect: Effect) -> Effect:
-    """A copy of an effect; what it knows of the arm, which does not change, is shared."""
-    return copy.deepcopy(effect, {id(effect.facts): effect.facts})
+def copied(module: Part) -> Part:
+    """An effect with parameters of its own; everything else is shared with the given one.
+
+    A diagnosis copies effects by the hundred: `copy.deepcopy`, which also copies what never
+    changes, took a tenth of its time.
+    """
+    twin = copy.copy(module)
+    twin._parameters = {
+        name: None if own is None else Parameter(own.detach().clone(), own.requires_grad)
+        for name, own in module._parameters.items()
+    }
+    twin._modules = {
+        name: None if part is None else copied(part) for name, part in module._modules.items()
+    }
+    return twin
 
 
 def with_effect(model: ArmModel, name: str, effect: Effect) -> ArmModel:
@@ -186,10 +203,11 @@ def more_of(problem: RowsOfModel, signal: Signals, name: str) -> Candidate | Non
     effect = problem.model.effects[name]
     if effect.stage != "material":
         return None
-    taps = signal.taps
-    if name not in taps.memory:
-        taps = problem.model.trace(problem.history)
-    before, after = problem.model.chain.around(name, taps)
+    chain = problem.model.chain
+    if name in signal.taps.memory:
+        before, after = chain.around(name, signal.taps)
+    else:
+        before, after = chain.followed_around(name, problem.history, signal.first)
     change = problem.rows(after - before)
     each = torch.diag_embed(change).movedim(-1, 0)
     sensitivities = torch.einsum(

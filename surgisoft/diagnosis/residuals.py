@@ -88,23 +88,29 @@ def noise_of(recordings: list[Recording]) -> tuple[np.ndarray, str]:
     for floor in (_stated_floor(recordings), hold_floor(recordings)):
         if floor.rmse_mm is not None:
             return np.full(count, max(floor.rmse_mm, LEAST_NOISE_MM)), floor.source
-    parts = [r.key_points_mm[run] for r in recordings for run in r.runs]
-    run = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    return _differences_noise(np.concatenate(parts), run)
+    number = [np.cumsum(np.diff(r.run, prepend=r.run[:1]) != 0) for r in recordings]
+    return _differences_noise([r.key_points_mm for r in recordings], number)
 
 
-def _differences_noise(points_mm: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, str]:
+def _differences_noise(
+    points_mm: Sequence[np.ndarray], run: Sequence[np.ndarray]
+) -> tuple[np.ndarray, str]:
     """(n,) RMS noise of each key point's distance, mm, from second differences, and its source.
 
-    points_mm: (N, n, 3), NaN where missing; run: (N,) run of each row. The spread is the median of
-    absolute values, scaled to the standard deviation of a normal distribution.
+    points_mm: (T, n, 3) of each recording, NaN where missing; run: (T,) run of each of its rows.
+    The spread is the median of absolute values, scaled to the standard deviation of a normal
+    distribution. One coordinate follows another, because the differences of all of them together
+    take several times the memory of the recordings.
     """
-    second = np.diff(points_mm, 2, axis=0)[run[2:] == run[:-2]]
-    seen = np.isfinite(second).any(axis=0)
-    spread = np.zeros(points_mm.shape[1:])
-    if seen.any():
-        median = np.nanmedian(np.abs(second[:, seen]), axis=0)
-        spread[seen] = 1.4826 * median / np.sqrt(6.0)
+    inside = [number[2:] == number[:-2] for number in run]
+    spread = np.zeros(points_mm[0].shape[1:])
+    for place in np.ndindex(*spread.shape):
+        second = np.concatenate(
+            [np.diff(p[:, *place], 2)[rows] for p, rows in zip(points_mm, inside, strict=True)]
+        )
+        second = second[~np.isnan(second)]
+        if len(second):
+            spread[place] = 1.4826 * np.median(np.abs(second)) / np.sqrt(6.0)
     noise = np.sqrt((spread**2).sum(1))
     source = "second differences" if noise.any() else "unknown"
     return np.maximum(noise, LEAST_NOISE_MM), source
@@ -249,7 +255,7 @@ class ResidualTable:
         noise, floor = self.noise_mm, self.floor
         if floor.source == "second differences":
             training = np.where(self.held_out[:, None, None], np.nan, self.measured_mm)
-            noise, source = _differences_noise(training, self.run)
+            noise, source = _differences_noise([training], [self.run])
             floor = _floor_of(noise, source)
         shown = self.held_out if part == "held_out" else ~self.held_out
         if np.isnan(self.measured_mm[~shown]).all():
@@ -659,12 +665,15 @@ def motions(history: History, half: np.ndarray, block: np.ndarray) -> np.ndarray
     whole = np.maximum(np.bincount(owner, minlength=count), 1)
     moving = np.abs(state[:, history.chambers :]).max(1) > STILL
     state, owner = state[moving], owner[moving]
-    shared = np.zeros((count, count))
-    # A row of one block and those of all blocks within reach of it, each block counted once.
-    near = cKDTree(state).query_ball_point(state, MOTION_ALIKE, p=np.inf)
-    for own, some in zip(owner, near, strict=True):
-        shared[own, np.unique(owner[some])] += 1.0
-    shared /= whole[:, None]
+    # Which rows have a row of which block within reach: each block counts once for a row.
+    near = np.zeros((len(owner), count), bool)
+    near[np.arange(len(owner)), owner] = True
+    first, second = cKDTree(state).query_pairs(MOTION_ALIKE, p=np.inf, output_type="ndarray").T
+    near[first, owner[second]] = True
+    near[second, owner[first]] = True
+    place, other = np.nonzero(near)
+    shared = np.bincount(owner[place] * count + other, minlength=count * count).astype(float)
+    shared = shared.reshape(count, count) / whole[:, None]
     alike = np.minimum(shared, shared.T) >= MOTION_SHARE
     answer, found = np.full(count, -1), 0
     for first in range(count):

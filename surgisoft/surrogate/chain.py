@@ -527,6 +527,19 @@ class Chain:
         before = self.walk(start, mode, self.static[:place])
         return before.value, self.walk(before, mode, self.static[place : place + 1]).value
 
+    @torch.no_grad()
+    def followed_around(self, name: str, history: History, first: Tensor) -> tuple[Tensor, Tensor]:
+        """(R, T, m) actuation in front of and behind a material effect along a history.
+
+        As `around`, but without the taps of a scan: memories are followed and not kept.
+        first: (R, m) actuation at which each run begins.
+        """
+        place = next(i for i, link in enumerate(self.inner) if link.name == name)
+        start = self.standing(first, signals=False)[0].memory
+        mode = Scanning(start, context_of(history), history=history, keeps=False)
+        before = self.walk(Signal(history.pressure), mode, self.inner[:place])
+        return before.value, self.walk(before, mode, self.inner[place : place + 1]).value
+
     def network_slope(self, actuation: Tensor, direction: Tensor) -> Tensor:
         """(S, n, 3, m) derivative of the key points by the effective actuation, mm a unit.
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from surgisoft.diagnosis.candidates import candidates, with_effect
+from surgisoft.diagnosis.candidates import candidates, copied, with_effect
 from surgisoft.diagnosis.residuals import held_out_rows, problem_of
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import Recording
@@ -33,6 +33,23 @@ def pressurised(recording):
     names = ("t_s", "measured", "key_points_mm")
     cut = Recording("cut", **{name: getattr(recording, name)[rows] for name in names})
     return problem_of(default_arm(), [cut], rows=400)
+
+
+@pytest.mark.parametrize("name", sorted(EFFECTS))
+def test_a_copied_effect_has_values_of_its_own(name):
+    """Amplitudes and nonlinear parameters of the copy change, those of the effect stay."""
+    effect = make_effect(name, default_arm().facts)
+    kept = {key: value.clone() for key, value in effect.state_dict().items()}
+    twin = copied(effect)
+    assert type(twin) is type(effect)
+    assert [*twin.state_dict()] == [*kept]
+    own = {**twin.amplitudes(), **twin.nonlinear_parameters()}
+    assert own.keys() == {**effect.amplitudes(), **effect.nonlinear_parameters()}.keys()
+    with torch.no_grad():
+        for parameter in own.values():
+            parameter.add_(1.0)
+    assert all(torch.equal(value, kept[key]) for key, value in effect.state_dict().items())
+    assert any(not torch.equal(value, kept[key]) for key, value in twin.state_dict().items())
 
 
 @pytest.mark.parametrize("name", ["creep", "inertia", "rate_dependence", "softening", "payload"])

@@ -7,7 +7,15 @@ import pytest
 import torch
 
 from surgisoft.diagnosis.diagnose import diagnose
-from surgisoft.diagnosis.residuals import folds, motions, problem_of
+from surgisoft.diagnosis.residuals import (
+    MOTION_ALIKE,
+    MOTION_SHARE,
+    STILL,
+    folds,
+    motion_states,
+    motions,
+    problem_of,
+)
 from surgisoft.diagnosis.statistics import sign_flip_p_values
 from surgisoft.surrogate.history import pack
 from tests.diagnosis.synthetic import PERIOD_S, recording, still_model, walk
@@ -46,6 +54,30 @@ def test_the_same_path_at_another_speed_is_another_motion(speed):
     slow, other = sweep(1.0, 1), sweep(speed, 1)
     block = np.concatenate([np.zeros(len(slow), int), np.ones(len(other), int)])
     assert motions(path(np.concatenate([slow, other])), HALF, block).tolist() == [0, 1]
+
+
+def test_blocks_are_alike_where_a_count_of_all_pairs_of_rows_says_so():
+    """Sweeps of several speeds in turns, one block each, against loops over blocks and rows."""
+    parts = [sweep(speed, 1) for speed in (1.0, 1.3, 3.0, 1.0, 2.0)]
+    block = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    history = path(np.concatenate(parts))
+    state = motion_states(history, HALF)
+    moving = np.abs(state[:, 2:]).max(1) > STILL
+    share = np.zeros((len(parts), len(parts)))
+    for one in range(len(parts)):
+        for row in state[moving & (block == one)]:
+            for other in range(len(parts)):
+                apart = np.abs(state[moving & (block == other)] - row).max(1)
+                share[one, other] += (apart <= MOTION_ALIKE).any()
+        share[one] /= (block == one).sum()
+    alike = np.minimum(share, share.T) >= MOTION_SHARE
+    assert 0 < alike[np.triu_indices(len(parts), 1)].sum() < 10
+    leader: list[int] = []
+    for one in range(len(parts)):
+        before = [each for each in sorted(set(leader)) if alike[each, one]]
+        leader.append(before[0] if before else one)
+    expected = [sorted(set(leader)).index(each) for each in leader]
+    assert motions(history, HALF, block).tolist() == expected
 
 
 def test_rows_of_no_block_count_for_nothing():

@@ -229,6 +229,11 @@ def test_long_recordings_are_followed_in_blocks_with_the_same_result(
             bare = arm.chain.scan(wide, long, memories=False)
             inputs = arm.chain.inputs(wide, long)
             kept.append(set(bare.memory))
+            for n in (n for n, e in arm.effects.items() if e.stage == "material"):
+                pairs = arm.chain.around(n, taps), arm.chain.followed_around(n, wide, long)
+                for told, followed in zip(*pairs, strict=True):
+                    assert torch.allclose(told, followed, atol=2e-5), n
+                assert not torch.equal(*pairs[1])
             seen = {n: taps.behind[e.stage] for n, e in arm.effects.items()}
             context = replace(context_of(wide), pressure=taps.pressure)
             there = {

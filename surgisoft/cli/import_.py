@@ -43,7 +43,7 @@ def import_(
         Path | None,
         typer.Option(
             metavar="NEW.toml",
-            help="Write a draft of the map from the names of a text file's columns, to be checked, "
+            help="Write a draft of the map from the names of a file's columns, to be checked, "
             "and nothing else.",
         ),
     ] = None,
@@ -134,7 +134,7 @@ def _draft(raw: list[Path], place: Path, force: bool) -> None:
     from surgisoft.measurement.importing import draft_map
 
     if len(raw) != 1 or raw[0].is_dir():
-        raise InputError(f"--draft: {len(raw)} raw files or a folder, expected one text file")
+        raise InputError(f"--draft: {len(raw)} raw files or a folder, expected one file")
     if place.suffix != ".toml":
         raise InputError(f"{place}: suffix '{place.suffix}', expected .toml")
     if place.exists() and not force:

@@ -398,7 +398,7 @@ REFUSED = {
     "import {dir}/full.csv -o {dir}/a.csv": "--map is missing: a map file states columns",
     "import {dir}/full.csv -o {dir}/a.xlsx": "suffix '.xlsx', expected .csv, .parquet or a folder",
     "import {dir}/full.csv {rec} --draft {dir}/m.toml": "2 raw files or a folder, expected one",
-    "import {dir} --draft {dir}/m.toml": "1 raw files or a folder, expected one text file",
+    "import {dir} --draft {dir}/m.toml": "1 raw files or a folder, expected one file",
     "import {dir}/full.csv --draft {dir}/m.txt": "suffix '.txt', expected .toml",
     "import {dir}/full.csv --draft {dir}/old.toml": "old.toml: exists already; choose another",
     "run scripted -o {dir}/a.csv --show --web": "--show and --web: expected at most one of them",

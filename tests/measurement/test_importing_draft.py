@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from surgisoft.cli import run
 from surgisoft.errors import InputError
@@ -75,6 +76,8 @@ def test_what_a_header_does_not_say_is_marked(tmp_path):
         ("north_set_bar,west_set_bar", "[commanded]"),
         ("target_p1_kPa,target_p2_kPa", "[commanded]"),
         ("Soll 1,Soll 2", "[commanded]"),
+        ("Pset_A [psi],Pset_B [psi]", "[commanded]"),
+        ("p_ref_1,p_ref_2", "[commanded]"),
         ("north_bar,west_bar", "[measured]  # check: measured by sensors?"),
     ],
 )
@@ -88,6 +91,43 @@ def test_set_values_are_no_measurements(tmp_path, names, table):
     found = imported(path, tmp_path)
     assert (found.commanded is not None) == (table == "[commanded]")
     np.testing.assert_allclose(found.measured, [row[1:3] for row in ROWS])
+
+
+def test_arrays_of_a_matlab_file_are_drafted(tmp_path):
+    """Struct fields: two tendons in mm, two markers of three columns each in cm, a repetition."""
+    rows = np.array(ROWS, float)
+    log = {
+        "t_ms": rows[:, :1],
+        "tendon_mm": rows[:, 1:3],
+        "marker_cm": rows[:, 3:],
+        "rep": rows[:, 0],
+    }
+    savemat(tmp_path / "lab.mat", {"log": log, "rate": 20.0})
+    found = imported(tmp_path / "lab.mat", tmp_path)
+    text = (tmp_path / "map.toml").read_text()
+    assert found.unit == "mm"
+    np.testing.assert_allclose(found.measured, rows[:, 1:3])
+    np.testing.assert_allclose(found.key_points_mm.reshape(-1, 6), 10 * rows[:, 3:])
+    assert len(found.runs) == len(ROWS)
+    assert '[runs]  # check: a new value begins a new run\ncolumn = "log.rep"' in text
+
+
+def test_of_equal_groups_the_draft_takes_the_first(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    rows = np.array(ROWS, float)
+    with h5py.File(tmp_path / "lab.h5", "w") as file:
+        for k in (1, 2):
+            group = file.create_group(f"take{k}")
+            group["time_ms"], group["valve_bar"] = 50.0 * np.arange(len(rows)), k * rows[:, 1:3]
+            group["tip_m"] = rows[:, 3:6]
+    found = imported(tmp_path / "lab.h5", tmp_path)
+    assert (
+        'topic = "take1"  # check: as many arrays are in take2'
+        in (tmp_path / "map.toml").read_text()
+    )
+    assert found.unit == "bar"
+    np.testing.assert_allclose(found.measured, rows[:, 1:3])
+    np.testing.assert_allclose(found.key_points_mm[:, 0], 1000 * rows[:, 3:6])
 
 
 def test_no_key_points_and_no_numbers_are_errors(tmp_path):

@@ -1,7 +1,8 @@
-"""A draft of a map file from the header of a laboratory's text file.
+"""A draft of a map file from the names of a raw file's columns.
 
-Only the names of the columns are read, and of the numbers their separator and decimal sign. What a
-name does not say (a unit, the frame) is marked for the person who checks the draft.
+Of a text file the draft also has the separator and the decimal sign. What a name does not say (a
+unit, the frame) is marked for the person who checks the draft. Names of columns that another reader
+makes are paths, such as `run1.tip_cm.0` in a MATLAB or HDF5 file.
 """
 
 import json
@@ -11,6 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from surgisoft.errors import InputError
+from surgisoft.measurement.importing.raw import FileRole
+from surgisoft.measurement.importing.readers import chosen, open_raw
+from surgisoft.measurement.importing.readers.text import READER as TEXT
 from surgisoft.measurement.recordings.columns import MM_PER
 from surgisoft.measurement.tables import read_text
 from surgisoft.measurement.units import ACTUATION_UNITS, SECONDS_PER
@@ -28,7 +32,7 @@ names in English and German, and what they find is marked for checking."""
 TIME = re.compile(r"t|time.*|zeit.*|(time)?stamps?|elapsed.*|clock|sec(onds)?", re.I)
 COMMAND = re.compile(
     r"cmd|command|soll|set[ _]?point|desired|reference|target|goal"
-    r"|(^|_)[cu]_?\d|[ _]set($|[ _])|(^|_)set[ _]?\w",
+    r"|(^|_)[cu]_?\d|[ _]set($|[ _])|(^|_)p?set[ _]?\w|(^|[ _])(ref|des)($|[ _])",
     re.I,
 )
 ACTUATION = re.compile(
@@ -37,37 +41,51 @@ ACTUATION = re.compile(
 )
 NOT_MEASURED = re.compile(r"target|goal|soll|reference|desired|predict|\bvel|\bacc", re.I)
 """Words in the names of positions that are no measured ones."""
-RUN = re.compile(r"(run|take|trial|episode|repeat)([_ ]?(id|nr|no|number|index))?", re.I)
+RUN = re.compile(r"(run|take|trial|episode|repeat|rep)([_ ]?(id|nr|no|number|index))?", re.I)
 AN_X = re.compile(r"(?<![A-Za-z])[xX](?![A-Za-z])|(?<=[a-z0-9])X(?![a-z])")
 """An x that stands for the axis: `x0`, `tip_x`, `tipX`."""
 AN_AXIS = re.compile(r"(^|[_ .])[xyz]($|[_ .\d])", re.I)
 """An axis in the name of a position."""
 
 
+A_PLACE = re.compile(r"((\.\d+)+)$")
+"""The place of a column in an array of several columns: `.2` of `tip_cm.2`."""
+
+
 @dataclass(frozen=True)
 class _Layout:
-    """How a text file is laid out."""
+    """How a file is laid out."""
 
-    separator: str
-    decimal: str
     names: tuple[str, ...]
     """Names of the columns."""
-    skip_rows: int
+    separator: str = ","
+    decimal: str = "."
+    skip_rows: int = 0
     """Lines before the header, or before the numbers where the header is not read."""
-    header: bool
+    header: bool = True
     """Whether the line before the numbers is the header."""
+    paths: bool = False
+    """Whether the names are paths of arrays and their columns, as in MATLAB and HDF5 files."""
+    topic: str = ""
+    """The group or struct to which the draft limits the file."""
+    groups: tuple[str, ...] = ()
+    """All groups or structs that hold the same columns as that one."""
+
+    def label(self, name: str) -> str:
+        """What says what a column is: its name, or of a path the name of the array."""
+        return A_PLACE.sub("", name).rpartition(".")[2] if self.paths else name
 
 
 def draft_map(path: str | Path) -> str:
-    """The text of a map for a laboratory's text file, to be checked by a person.
+    """The text of a map for a raw file, to be checked by a person.
 
-    Raises InputError for a file without rows of numbers, and where no columns of key points are
-    recognised.
+    Raises InputError for a file that no reader reads, for one without rows of numbers, and where no
+    columns of key points are recognised.
     """
     path = Path(path)
-    layout = _layout(path)
-    names = layout.names
-    points = _key_points(names)
+    layout = _layout(path) if chosen(path, FileRole()) is TEXT else _table_layout(path)
+    names, label = layout.names, layout.label
+    points = [*_key_points(names), *(_key_point_arrays(layout) if layout.paths else [])]
     if not points:
         shown = ", ".join(name for name in names[:12] if name)
         raise InputError(
@@ -75,11 +93,13 @@ def draft_map(path: str | Path) -> str:
             "write the map by hand, docs/recordings.md has one to start from"
         )
     used = {name for point in points for name in point}
-    time = next((n for n in names if TIME.fullmatch(_split(n, SECONDS_PER)[0].strip())), None)
+    time = next(
+        (n for n in names if TIME.fullmatch(_split(label(n), SECONDS_PER)[0].strip())), None
+    )
     used |= {time} if time else set()
     rest = [name for name in names if name and name not in used]
-    commanded = [name for name in rest if _is_command(name)]
-    measured = [n for n in rest if n not in commanded and _is_actuation(n)]
+    commanded = [name for name in rest if _is_command(label(name))]
+    measured = [n for n in rest if n not in commanded and _is_actuation(label(n))]
     lines = [
         f"# Draft of a map for {path.name}, from the names of its columns. Check every line:",
         "# units, the order of the channels, the key points from base to tip, the frame.",
@@ -92,7 +112,7 @@ def draft_map(path: str | Path) -> str:
     if time is None:
         lines += ["rate_hz = 20.0  # check: no column of time is recognised", ""]
     else:
-        unit = _unit([time], SECONDS_PER, "s")
+        unit = _unit([label(time)], SECONDS_PER, "s")
         lines += [f"column = {column([time])[0]}", f"unit = {unit}", ""]
     doubt = "" if commanded else "  # check: measured by sensors? Set values are [commanded]"
     if commanded and not measured:
@@ -100,7 +120,7 @@ def draft_map(path: str | Path) -> str:
         doubt = "  # check: set values stand in, no sensor is here; fit with --actuation commanded"
     for table, found in ((f"[measured]{doubt}", measured), ("[commanded]", commanded)):
         if found:
-            unit = _unit(found, ACTUATION_UNITS, "kPa")
+            unit = _unit([label(n) for n in found], (*ACTUATION_UNITS, *MM_PER), "kPa")
             lines += [table, f"columns = [{', '.join(column(found))}]", f"unit = {unit}"]
             lines += ['# to = "kPa"  # the unit of your model, if it is another one', ""]
     if not measured and not commanded:
@@ -109,14 +129,16 @@ def draft_map(path: str | Path) -> str:
     lines += [
         "[key_points]  # check: from base to tip",
         f"positions = [{triples}]",
-        f"unit = {_unit([name for point in points for name in point], MM_PER, 'mm')}",
+        f"unit = {_unit([label(name) for point in points for name in point], MM_PER, 'mm')}",
         "",
         "# [frame]  # check: the recording's z points along the arm at rest, away from the base",
         '# rotation = "x z -y"  # our x is your x, our y your z, our z minus your y',
         '# origin = "k0"',
         "# gravity = [0, -1, 0]  # direction of weight in your frame",
     ]
-    runs = next((name for name in rest if RUN.fullmatch(name) and name not in commanded), None)
+    runs = next(
+        (name for name in rest if RUN.fullmatch(label(name)) and name not in commanded), None
+    )
     if runs:
         lines += [
             "",
@@ -127,6 +149,23 @@ def draft_map(path: str | Path) -> str:
     if unused:
         lines += ["", f"# not used: {', '.join(unused)}"]
     return "\n".join(lines) + "\n"
+
+
+def _table_layout(path: Path) -> _Layout:
+    """The layout of a file that a reader turns into columns with names.
+
+    Of several groups with the same arrays, such as one for each run, the draft takes the first.
+    """
+    names = open_raw(path, FileRole()).names
+    arrays: dict[str, list[str]] = {}
+    for name in names:
+        group, dot, rest = name.partition(".")
+        arrays.setdefault(group, []).append(rest if dot else "")
+    first = next(iter(arrays))
+    groups = tuple(group for group, inside in arrays.items() if inside == arrays[first])
+    if len(groups) > 1 and any(re.search(r"[^\d.]", name) for name in arrays[first]):
+        return _Layout(tuple(arrays[first]), paths=True, topic=first, groups=groups)
+    return _Layout(tuple(names), paths=True)
 
 
 def _layout(path: Path) -> _Layout:
@@ -157,12 +196,12 @@ def _layout(path: Path) -> _Layout:
     if head is None or len(rows[head]) != most or (head + 1 < first and not units):
         head = None
     if head is None:
-        return _Layout(separator, "," if comma else ".", ("",) * most, first, False)
+        return _Layout(("",) * most, separator, "," if comma else ".", first, False)
     names = [name.strip().removeprefix("#").strip().strip('"') for name in rows[head]]
     if units:
         names = [f"{name} [{unit.strip('[]() ')}]" for name, unit in zip(names, units, strict=True)]
     return _Layout(
-        separator, "," if comma else ".", tuple(names), first if units else head, not units
+        tuple(names), separator, "," if comma else ".", first if units else head, not units
     )
 
 
@@ -215,6 +254,24 @@ def _key_points(names: Sequence[str]) -> list[tuple[str, str, str]]:
     return found
 
 
+def _key_point_arrays(layout: _Layout) -> list[tuple[str, str, str]]:
+    """Columns x, y, z of the points in arrays of three columns each, in the order of the file."""
+    arrays: dict[str, list[str]] = {}
+    for name in layout.names:
+        if A_PLACE.search(name):
+            arrays.setdefault(A_PLACE.sub("", name), []).append(name)
+    found = []
+    for array, columns in arrays.items():
+        label = layout.label(array)
+        ours = ACTUATION.search(label) or COMMAND.search(label) or NOT_MEASURED.search(label)
+        in_mm = bool(_split(label, MM_PER)[1])
+        if len(columns) % 3 == 0 and not ours and (in_mm or not _is_actuation(label)):
+            found += [
+                (columns[k], columns[k + 1], columns[k + 2]) for k in range(0, len(columns), 3)
+            ]
+    return found
+
+
 def _is_command(name: str) -> bool:
     """Whether a column is an actuation that was asked for, and no position that was."""
     stem = _split(name, ACTUATION_UNITS)[0]
@@ -251,6 +308,12 @@ def _columns(layout: _Layout):
 def _file(layout: _Layout) -> list[str]:
     """The table [file.main] where the layout is not the usual one."""
     lines = []
+    if layout.topic:
+        more = ", ".join(layout.groups[1:4]) + (", ..." if len(layout.groups) > 4 else "")
+        lines.append(
+            f"topic = {json.dumps(layout.topic)}  # check: as many arrays are in {more}; a map "
+            "reads one group, so import each by a map of its own"
+        )
     if layout.separator != ",":
         lines.append(f"separator = {json.dumps(layout.separator)}")
     if layout.decimal != ".":

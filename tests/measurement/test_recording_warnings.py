@@ -60,11 +60,31 @@ def without_noise(seed, samples=1200):
     return Recording("x", np.arange(samples) / RATE_HZ, p, body(p), commanded=p.copy())
 
 
+def random_walk(seed, samples=3000):
+    """Tendons without noise, one of which rests: ramps, rests and a random walk, no command.
+
+    The steps of the walk are white, so it zigzags as often as noise, and its rests are bit-equal.
+    """
+    rng = np.random.default_rng(seed)
+    p = np.empty((0, 2))
+    while len(p) < samples:
+        start, rows = p[-1:] if len(p) else np.full((1, 2), 40.0), int(rng.integers(30, 200))
+        walk = start + np.cumsum(rng.normal(0, 1.0, (rows, 2)), axis=0)
+        ramp = start + np.linspace(0, 1, rows)[:, None] * (rng.uniform(0, 80, 2) - start)
+        moved = walk if rng.random() < 0.4 else ramp
+        moved = np.where(rng.random(2) < 0.4, start, moved)
+        p = np.concatenate([p, moved, np.repeat(moved[-1:], rng.integers(0, 120), axis=0)])
+    p = p[:samples]
+    points = body(p) + rng.normal(0, 0.05, (samples, 3, 3))
+    return Recording("x", np.arange(samples) / RATE_HZ, p, points)
+
+
 CLEAN = {
     "slow and noisy": slow_and_noisy,
     "fast": lambda seed: slow_and_noisy(seed, hz=3.0),
     "noise only": lambda seed: slow_and_noisy(seed, noise=3.0),
     "steps": steps,
+    "random walk": random_walk,
     "settled": settled,
     "without noise": without_noise,
     "without noise or command": lambda seed: dataclasses.replace(
@@ -101,6 +121,19 @@ def test_frozen_channel_is_found_with_its_place(with_command, seed, start, lengt
         f"p2_kPa repeat bit-equal for {length} rows ({seconds:.3g} s) while other signals move; "
         "frozen?"
     )
+
+
+def test_a_noisy_reading_that_freezes_often_is_one_finding():
+    """Without a command, many repeats could be rests: the noise between them decides."""
+    clean = slow_and_noisy(4, samples=4000, hz=0.001)
+    reading = clean.measured.copy()
+    for start in (500, 1100, 1700, 2900):
+        reading[start : start + 100, 0] = reading[start, 0]
+    found = find_warnings(dataclasses.replace(clean, measured=reading, commanded=None))
+    assert [warning.text for warning in found] == [
+        "p1_kPa repeat bit-equal for 100 rows (4.95 s) while other signals move, "
+        "and 3 more times; frozen?"
+    ]
 
 
 def test_channels_that_freeze_together_are_one_finding():

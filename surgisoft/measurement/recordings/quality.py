@@ -18,6 +18,14 @@ LEAST_FROZEN_ROWS = 20
 """Shorter repeats are never called frozen."""
 FROZEN_RATIO = 5.0
 """How many times longer than its usual longest repeat (99 % quantile) a frozen signal repeats."""
+SOME_ZIGZAGS = 0.05
+"""Share of two turns on end above which a reading is noisy [-]: 0 of a smooth signal."""
+RESTS = 3
+"""From so many repeats of LEAST_FROZEN_ROWS on, a channel without a command rests by design, unless
+nearly all of its other rows are noise (a count)."""
+MOSTLY_NOISE = 1 / 3
+"""Share of two turns on end above which nearly all rows are noise [-]: between 1/4 of a random
+walk, which is an actuation, and 5/12 of white noise (Bienaymé 1874: runs up and down)."""
 JUMP_RATIO = 6.0
 """How many times larger than the usual steps before and after it a jump is."""
 JUMP_SHARE = 0.02
@@ -66,10 +74,14 @@ def _changes(signal: np.ndarray, run: np.ndarray) -> np.ndarray:
     return np.concatenate([[True], differs])
 
 
+def _lengths(changed: np.ndarray) -> np.ndarray:
+    """Number of rows of each stretch that repeats one value."""
+    return np.diff(np.append(np.flatnonzero(changed), len(changed)))
+
+
 def _long_repeats(changed: np.ndarray) -> list[slice]:
     """The stretches that repeat one value for much longer than the signal usually does."""
-    starts = np.flatnonzero(changed)
-    lengths = np.diff(np.append(starts, len(changed)))
+    starts, lengths = np.flatnonzero(changed), _lengths(changed)
     others = np.sort(lengths)[:-1]
     usual = np.quantile(others, 0.99, method="lower") if len(others) else 0
     least = max(LEAST_FROZEN_ROWS, FROZEN_RATIO * usual)
@@ -89,21 +101,27 @@ def _outside(stretch: slice, rows: int) -> np.ndarray:
     return mask
 
 
-def _flickers(channel: np.ndarray, changed: np.ndarray) -> bool:
+def _flickers(channel: np.ndarray, changed: np.ndarray, least: float = SOME_ZIGZAGS) -> bool:
     """Whether a reading (T,) zigzags like noise over the rows (T,) where it changes.
 
-    Two turns on end: 5 in 12 of white noise, none of a smooth signal.
+    Two turns on end: 5 in 12 of white noise, 1 in 4 of a random walk, none of a smooth signal.
     """
     steps = np.sign(np.diff(channel[changed]))
     zigzags = (steps[1:-1] * steps[:-2] < 0) & (steps[1:-1] * steps[2:] < 0)
-    return len(zigzags) > 10 and zigzags.mean() > 0.05
+    return len(zigzags) > 10 and zigzags.mean() > least
 
 
-def _channel_froze(recording: Recording, i: int, changed: np.ndarray, stretch: slice) -> bool:
-    """Whether this repeat of channel i is a fault: its command moves, or it is never at rest."""
+def _channel_froze(
+    recording: Recording, i: int, changed: np.ndarray, stretch: slice, rests: int
+) -> bool:
+    """Whether this repeat of channel i is a fault: its command moves, or it is never at rest.
+
+    rests: number of repeats of the channel that are long enough for a fault.
+    """
     outside = _outside(stretch, recording.samples)
     if recording.commanded is None:
-        return _flickers(recording.measured[:, i], changed & outside)
+        least = SOME_ZIGZAGS if rests < RESTS else MOSTLY_NOISE
+        return _flickers(recording.measured[:, i], changed & outside, least)
     command = recording.commanded[:, i]
     rest = ~_changes(command[:, None], recording.run)
     if _flickers(recording.measured[:, i], changed & outside & rest):
@@ -120,11 +138,12 @@ def frozen_channels(recording: Recording) -> list[tuple[list[int], slice]]:
     points: list[np.ndarray] = []
     frozen: list[tuple[int, slice]] = []
     for i, changed in enumerate(channels):
+        rests = int((_lengths(changed) >= LEAST_FROZEN_ROWS).sum())
         for stretch in _long_repeats(changed):
             points = points or _key_point_changes(recording)
             others = [*channels[:i], *channels[i + 1 :], *points]
             alive = any(_lives(other, stretch) for other in others)
-            if alive and _channel_froze(recording, i, changed, stretch):
+            if alive and _channel_froze(recording, i, changed, stretch, rests):
                 frozen.append((i, stretch))
     return _merged(frozen)
 
@@ -134,9 +153,9 @@ def _frozen_channels(recording: Recording) -> list[QualityWarning]:
         QualityWarning(
             stretch.start,
             f"{', '.join(f'p{i + 1}_{recording.unit}' for i in members)} repeat bit-equal for "
-            f"{_duration(recording, stretch)} while other signals move; frozen?",
+            f"{_duration(recording, stretch)} while other signals move{_more(times)}; frozen?",
         )
-        for members, stretch in frozen_channels(recording)
+        for members, stretch, times in _first(frozen_channels(recording))
     ]
 
 
@@ -152,6 +171,21 @@ def _merged(frozen: list[tuple[int, slice]]) -> list[tuple[list[int], slice]]:
         else:
             groups.append(([i], stretch))
     return [(sorted(members), stretch) for members, stretch in groups]
+
+
+def _first(found: list[tuple[list[int], slice]]) -> list[tuple[list[int], slice, int]]:
+    """The first stretch of each set of signals that froze together, and how many it has."""
+    stretches: dict[tuple[int, ...], list[slice]] = {}
+    for members, stretch in found:
+        stretches.setdefault(tuple(members), []).append(stretch)
+    return [(list(members), all_[0], len(all_)) for members, all_ in stretches.items()]
+
+
+def _more(times: int) -> str:
+    """The words for further findings of one kind."""
+    if times < 2:
+        return ""
+    return f", and {times - 1} more time{'s' if times > 2 else ''}"
 
 
 def _duration(recording: Recording, stretch: slice) -> str:
@@ -195,9 +229,9 @@ def _frozen_key_points(recording: Recording) -> list[QualityWarning]:
         QualityWarning(
             stretch.start,
             f"key point {', '.join(f'k{j}' for j in members)} repeats bit-equal for "
-            f"{_duration(recording, stretch)} while other signals move; frozen?",
+            f"{_duration(recording, stretch)} while other signals move{_more(times)}; frozen?",
         )
-        for members, stretch in frozen_key_points(recording)
+        for members, stretch, times in _first(frozen_key_points(recording))
     ]
 
 
@@ -364,9 +398,8 @@ def _explained(
 
 def _jump(j: int, found: list[tuple[int, float]]) -> QualityWarning:
     row, size = found[0]
-    more = f", and {len(found) - 1} more times" if len(found) > 1 else ""
     return QualityWarning(
-        row, f"key point k{j} jumps by {size:.3g} mm{more}; markers swapped or lost?"
+        row, f"key point k{j} jumps by {size:.3g} mm{_more(len(found))}; markers swapped or lost?"
     )
 
 

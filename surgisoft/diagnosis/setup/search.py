@@ -563,8 +563,9 @@ class Search:
     def _proved(self, before: Fitted, after: Fitted) -> bool:
         """Whether a correction shows what `Proof` asks for."""
         asked = self.proof
-        # In a wrong unit of length the error before is in that unit, too.
-        start = before.rmse_mm * max(1.0, after.hypothesis.mm_per_unit)
+        # In a wrong unit of length the error before is in that unit, too: no error falls because
+        # positions are divided by ten.
+        start = before.rmse_mm * after.hypothesis.mm_per_unit
         enough = self._share(start, after.rmse_mm) >= asked.explained or (
             after.rmse_mm <= min(asked.noticed * self.levels.reference, start / asked.halved)
         )

@@ -48,9 +48,10 @@ Kind = Literal[
     "cannot_tell",
     "setup",
 ]
-Reason = Literal["network", "learned", "few_data", "schedule"]
+Reason = Literal["network", "learned", "repeatability", "few_data", "schedule"]
 """Why a diagnosis cannot tell: the model is not that of this arm; the model has learned part of
-what is missing; there are too few motions; the schedule does not tell effects apart."""
+what is missing; how well recordings of an unchanged arm agree is not known well enough; there are
+too few motions; the schedule does not tell effects apart."""
 
 SCHEMA = 4
 """Version of the asset's format and of the features: weights belong to the features that they were
@@ -949,11 +950,17 @@ def _mostly_static(evidence: Evidence) -> bool:
 
 
 def reason_of(evidence: Evidence, chances: Probabilities) -> Reason:
-    """Why a diagnosis cannot tell."""
-    if _mostly_static(evidence) and chances.network + chances.nothing >= chances.known:
-        return "network"
+    """Why a diagnosis cannot tell.
+
+    A paired difference contains no error of the model, so no reason of the model applies to it.
+    """
     memory = evidence.free_box - evidence.free_static
-    if evidence.error_over_validated <= CLAIM.most_over_validated and memory >= LEARNED:
+    if evidence.paired:
+        if chances.nothing >= chances.known + chances.unknown:
+            return "repeatability"
+    elif _mostly_static(evidence) and chances.network + chances.nothing >= chances.known:
+        return "network"
+    elif evidence.error_over_validated <= CLAIM.most_over_validated and memory >= LEARNED:
         return "learned"
     few = FEW_PAIRED_MOTIONS if evidence.paired else FEW_MOTIONS
     return "few_data" if evidence.motions < few else "schedule"

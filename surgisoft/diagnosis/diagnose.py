@@ -89,6 +89,9 @@ REASONS = {
     "learned": "the error is no larger than the model's validated error, and a black box with "
     "memory explains a part of it that no static function explains, so the network has learned "
     "part of the missing effect: fit a network together with effects",
+    "repeatability": "most probably nothing has changed, but the change is not clearly as small as "
+    "the differences between recordings of an unchanged arm: record the same schedule twice before "
+    "a change, so that these differences are known",
     "few_data": "the recordings contain too few different motions",
     "schedule": "several causes explain these recordings about equally well, and none well enough",
 }
@@ -659,6 +662,8 @@ def next_command(decision: Decision) -> str:
         return (
             f"surgisoft amend {{model}} --effect {' '.join(names)} --data {{data}}{{before}} -o NEW"
         )
+    if decision.reason == "repeatability":
+        return ""
     between = names or tuple(decision.probabilities.effects)[:2]
     plan = f"surgisoft next-experiment {{model}} {{data}} --between {' '.join(between)}"
     plan = f"{plan} -o SCHEDULE.csv"

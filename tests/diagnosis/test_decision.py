@@ -26,6 +26,7 @@ from surgisoft.diagnosis.decision import (
     features_of,
     load_decision,
     probabilities,
+    reason_of,
 )
 from surgisoft.diagnosis.evidence import EffectEvidence, Evidence, ProposalEvidence
 from surgisoft.errors import InputError
@@ -124,6 +125,18 @@ def test_why_it_cannot_be_told(changes, reason):
     quiet = given_odds(missing=0.0, known=-0.5)
     found = decide(replace(GOOD, **changes), quiet, Worth(wrong_network=-4.0))
     assert (found.kind, found.reason) == ("cannot_tell", reason)
+
+
+@pytest.mark.parametrize(
+    ("missing", "motions", "reason"),
+    [(-0.3, 200, "repeatability"), (0.3, 200, "schedule"), (0.3, 6, "few_data")],
+)
+def test_a_paired_difference_is_never_blamed_on_the_model(missing, motions, reason):
+    """Even if a static function explains most of it, or it is as small as the validated error."""
+    odds = given_odds(missing=missing, known=-0.5)
+    for changes in ({"free_static": 0.85}, {"error_over_validated": 1.0}, {"free_box": 0.0}):
+        evidence = replace(GOOD, paired=True, motions=motions, **changes)
+        assert reason_of(evidence, probabilities(evidence, odds)) == reason
 
 
 @pytest.mark.parametrize("over", [1.6, 3.0, 9.0])

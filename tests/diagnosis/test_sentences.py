@@ -144,6 +144,8 @@ def decision(kind, *effects, reason=None, chances=CHANCES, statements=()) -> Dec
          "surgisoft next-experiment {model} {data} --between creep drift -o SCHEDULE.csv"),
         (decision("cannot_tell", chances=NONE), "several causes explain these recordings about",
          "surgisoft next-experiment {model} {data} -o SCHEDULE.csv"),
+        (decision("cannot_tell", reason="repeatability"), "record the same schedule twice before a",
+         ""),
         (decision("nothing_missing"), "these recordings show no missing effect; error",
          ""),
     ],

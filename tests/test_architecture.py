@@ -277,8 +277,14 @@ UNIX_NAMES = {
     "fork",
     "killpg",
     "geteuid",
+    "getpgrp",
+    "pthread_sigmask",
+    "sched_setscheduler",
+    "tcgetpgrp",
+    "MAP_SHARED",
+    "PROT_READ",
 }
-"""Names of `signal` and `os` that Windows lacks."""
+"""Names of `mmap`, `os` and `signal` that Windows lacks."""
 
 
 def on_import(node: ast.AST):
@@ -302,10 +308,34 @@ def unix_only(source: str) -> list[str]:
     return found
 
 
+GUARDS = ("sys.platform", "os.name", "hasattr(", "ImportError", "AttributeError")
+"""How a module asks whether the system has a name."""
+
+
+def unguarded(source: str) -> list[str]:
+    """Names that Windows lacks, anywhere in a module that does not ask for the system."""
+    return [
+        f"{node.value.id}.{node.attr}"
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Attribute)
+        and isinstance(node.value, ast.Name)
+        and node.value.id in ("mmap", "os", "signal")
+        and node.attr in UNIX_NAMES
+        and not any(guard in source for guard in GUARDS)
+    ]
+
+
 def test_windows_can_import_every_module():
     assert unix_only("import pty\nS = (signal.SIGHUP,)\ndef f():\n    import tty") == [
         "pty",
         "SIGHUP",
     ]
     needs = {str(path): unix_only(path.read_text()) for path in PACKAGE.rglob("*.py")}
+    assert {path: found for path, found in needs.items() if found} == {}
+
+
+def test_what_windows_lacks_is_asked_for():
+    assert unguarded("def f():\n    return mmap.PROT_READ") == ["mmap.PROT_READ"]
+    assert unguarded("def f():\n    if sys.platform == 'linux':\n        os.fork()") == []
+    needs = {str(path): unguarded(path.read_text()) for path in PACKAGE.rglob("*.py")}
     assert {path: found for path, found in needs.items() if found} == {}

@@ -52,7 +52,8 @@ def open_metadata(path: Path) -> pq.FileMetaData:
         rows, columns = content.num_rows, content.num_columns
         check_claim(path, 8 * rows * columns, f"{rows} rows of {columns} columns")
         if rows:
-            with path.open("rb") as file, mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ) as data:
+            read = mmap.ACCESS_READ
+            with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=read) as data:
                 _check(path, data)
     except InputError:
         raise

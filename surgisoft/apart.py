@@ -7,6 +7,7 @@ they allocate. A child process with limits calls the library; its end is an erro
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import io
 import json
@@ -93,9 +94,10 @@ def unpacked(content: bytes) -> tuple[Any, list[np.ndarray]]:
 
 
 def limit(size: int) -> None:
-    """Limit this process for a file of so many bytes; Windows has no limits.
+    """Limit this process for a file of so many bytes, as far as the system can.
 
-    Address space, processor time, no core file.
+    Address space, processor time, no core file. Windows has no limits, and macOS refuses one of the
+    address space.
     """
     try:
         import resource
@@ -107,7 +109,8 @@ def limit(size: int) -> None:
     for kind, value in (*wanted, (resource.RLIMIT_CORE, 0)):
         hard = resource.getrlimit(kind)[1]
         value = value if hard == resource.RLIM_INFINITY else min(value, hard)
-        resource.setrlimit(kind, (value, hard))
+        with contextlib.suppress(ValueError, OSError):
+            resource.setrlimit(kind, (value, hard))
 
 
 def answer(module: str, path: Path) -> int:

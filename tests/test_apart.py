@@ -45,6 +45,7 @@ def test_every_end_is_one_line(tmp_path, way, said):
 
 def test_a_reader_without_end_is_ended(tmp_path):
     """Processor time is limited by the size of the file: 4 s for a small one, here 0.5 s."""
+    pytest.importorskip("resource", reason="Windows has no limits")
     path = tmp_path / "a.txt"
     path.write_text("endless")
     assert apart.PATIENCE_S == 4.0
@@ -61,3 +62,18 @@ def test_nothing_that_a_process_writes_is_run(tmp_path):
     np.savez(tmp_path / "b.npz", facts=np.array([object()]))
     with pytest.raises(ValueError, match="allow_pickle"):
         unpacked((tmp_path / "b.npz").read_bytes())
+
+
+def test_a_limit_that_the_system_refuses_is_left_out(monkeypatch):
+    """macOS refuses a limit of the address space; the others are set all the same."""
+    resource = pytest.importorskip("resource", reason="Windows has no limits")
+    given = []
+
+    def setrlimit(kind, values):
+        if kind == resource.RLIMIT_AS:
+            raise ValueError("current limit exceeds maximum limit")
+        given.append(kind)
+
+    monkeypatch.setattr(resource, "setrlimit", setrlimit)
+    apart.limit(1000)
+    assert given == [resource.RLIMIT_CPU, resource.RLIMIT_CORE]

@@ -18,6 +18,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import rerun as rr
 
@@ -198,8 +199,9 @@ LEAST, MOST = 100, 4000
 """Bounds of width and height (points)."""
 NOTICES_S = 7.0
 """Time for which the viewer's start-up notices cover the picture (s)."""
-PATIENCE_S = 60.0
-"""Longest time for the viewer to load the recording and draw (s)."""
+PATIENCE_S = 180.0
+"""Longest time for the viewer to load the recording and draw (s); a machine with a load of 20 on
+two cores takes 60."""
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -268,11 +270,24 @@ def _draw(port: int, view: str | None, cursor, max_size: int, wait_s: float) -> 
             client.set_time(cursor[0], **place, play_state="paused")
         time.sleep(wait_s)
         shown = None if view is None else found
-        picture, before = client.take_screenshot(shown, max_size=max_size), b""
+        picture, before = painted(client, shown, max_size, end), b""
         while picture != before and time.monotonic() < end:
             time.sleep(0.3)
-            before, picture = picture, client.take_screenshot(shown, max_size=max_size)
+            before, picture = picture, painted(client, shown, max_size, end)
         return _packed(picture)
+
+
+def painted(client: Any, view_id: Any, max_size: int, end: float) -> bytes:
+    """The viewer's picture as PNG; it has 15 s for one, and is asked again until the time `end`."""
+    while True:
+        try:
+            return client.take_screenshot(view_id, max_size=max_size)
+        except TimeoutError:
+            if time.monotonic() > end:
+                raise InputError(
+                    f"the Rerun viewer drew no picture within {PATIENCE_S:g} s, as on a machine "
+                    "that is busy with other work; try again later"
+                ) from None
 
 
 def _packed(png: bytes) -> bytes:

@@ -1,8 +1,13 @@
-"""Which replay a path names."""
+"""Which replay a path names, and a viewer that is slow to draw it."""
 
 import os
+import time
 
+import pytest
+
+from surgisoft.errors import InputError
 from surgisoft.replay.show import MAGIC, find_replay
+from surgisoft.replay.viewer import painted
 
 
 def test_the_newest_replay_of_a_run_is_found(tmp_path):
@@ -14,3 +19,22 @@ def test_the_newest_replay_of_a_run_is_found(tmp_path):
         os.utime(path, (1e9 - age, 1e9 - age))
     assert find_replay(tmp_path) == places[1]
     assert find_replay(places[0]) == places[0]
+
+
+class Busy:
+    """A viewer that misses its own time limit a number of times before it draws."""
+
+    def __init__(self, misses: int):
+        self.misses = misses
+
+    def take_screenshot(self, view_id, *, max_size):
+        if self.misses:
+            self.misses -= 1
+            raise TimeoutError("Deadline expired before operation could complete")
+        return f"{view_id} {max_size}".encode()
+
+
+def test_a_busy_viewer_is_asked_again_until_the_end():
+    assert painted(Busy(2), "Scene", 1600, time.monotonic() + 60.0) == b"Scene 1600"
+    with pytest.raises(InputError, match="drew no picture within 180 s"):
+        painted(Busy(2), "Scene", 1600, time.monotonic() - 1.0)

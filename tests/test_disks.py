@@ -3,7 +3,6 @@
 import multiprocessing
 import os
 import re
-import resource
 import subprocess
 import sys
 from datetime import datetime
@@ -26,6 +25,8 @@ from surgisoft.replay import live_view
 from surgisoft.replay.recording import new_recording
 from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
 from tests.diagnosis.synthetic import recording, walk
+
+resource = pytest.importorskip("resource", reason="limits of a process, which Windows lacks")
 
 FULL = """
 import os, sys
@@ -167,7 +168,7 @@ def test_a_live_view_ends_where_its_file_cannot_be_written(tmp_path):
     assert limited_alone("a_live_view", path, 1 << 30)[0].startswith("written ")
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+@pytest.mark.skipif(getattr(os, "geteuid", lambda: 1)() == 0, reason="root may write everywhere")
 def test_a_folder_that_cannot_be_written_is_one_line(tmp_path):
     tmp_path.chmod(0o500)
     with pytest.raises(InputError, match="not a writable folder"):

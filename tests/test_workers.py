@@ -45,7 +45,7 @@ def test_a_killed_process_leaves_no_worker_behind(tmp_path):
     pids = [int(word) for word in asker.stdout.readline().split()]
     assert len(pids) == 2
     assert all(alive(pid) for pid in pids)
-    asker.send_signal(signal.SIGKILL)
+    asker.kill()
     asker.wait()
     until = time.monotonic() + 10.0
     while any(alive(pid) for pid in pids) and time.monotonic() < until:

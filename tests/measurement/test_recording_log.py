@@ -2,7 +2,6 @@
 
 import json
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -152,7 +151,7 @@ def test_after_kill_9_every_sample_is_there(tmp_path):
     child = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
     for _ in range(6):
         assert child.stdout.readline() == "sample\n"
-    child.send_signal(signal.SIGKILL)
+    child.kill()
     taken = 6 + len(child.stdout.read().splitlines())
     child.wait()
     recording, lacking = read_log(log)

@@ -253,6 +253,8 @@ def write_replay(
         _log_paths(columns, log, moments)
         for name in log.beams:
             _log_beam(columns, log, name, moments)
+        if points_beyond_the_tip(log):
+            _log_pointing_line(columns, log, moments)
         for name in log.cameras:
             log_camera(columns, log, name, moments, finite_rows(log, pictures_hz), report)
         for line in (line for plot in plots for line in plot.lines):
@@ -445,12 +447,31 @@ def _log_beam(columns: Columns, log: EpisodeLog, name: str, rows: np.ndarray) ->
     columns.send(f"{entity}/hit", rows, spots)
 
 
+def points_beyond_the_tip(log: EpisodeLog) -> bool:
+    """Whether the task's point is where the tip of the only arm points, as in `laser_plane`."""
+    if log.beams or len(log.arms) != 1:
+        return False
+    (arm,) = log.arms.values()
+    beyond_mm = np.linalg.norm(log.actual_mm - arm.line_mm[:, -1], axis=1)
+    return bool(np.nanmin(beyond_mm) > arm.radius_mm)
+
+
+def _log_pointing_line(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
+    """Log the line from the tip to the task's point, in the colour of a beam."""
+    (arm,) = log.arms.values()
+    ends = np.stack((arm.line_mm[:, -1], log.actual_mm), axis=1)[rows]
+    style = rr.LineStrips3D.from_fields(colors=BEAM_COLOUR, radii=0.2)
+    columns.recording.log("/beam", style, static=True)
+    columns.send("/beam", rows, rr.LineStrips3D.columns(strips=list(ends)))
+
+
 def legend(log: EpisodeLog) -> str:
     """Markdown that explains those colours of the 3D view that occur in the log."""
     rows = [
         ("yellow", "reference path and target", True),
         ("cyan", "actual path, beam on" if log.beams else "actual path", True),
         ("green line", "beam; thick while on", bool(log.beams)),
+        ("green line", "beam from the tip to the plane", points_beyond_the_tip(log)),
         ("blue lines", "the endoscope's field of view", bool(log.cameras)),
         ("pale, black", "tissue below, above ablation", log.dose is not None),
         ("white points", "key points as measured by the cameras", log.on == "rig"),

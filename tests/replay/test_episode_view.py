@@ -297,12 +297,20 @@ def test_a_role_has_one_hue_in_the_3d_view_and_in_the_endoscope(role):
 
 def test_a_log_becomes_a_replay_by_command(tmp_path, capsys):
     path = tmp_path / "log.npz"
-    save_episode(recorded("laser_plane", 8), path)
+    log = recorded("laser_plane", 8)
+    save_episode(log, path)
     began = time.perf_counter()
     assert run(["replay", str(path), "--save", str(tmp_path / "log.rrd")]) == 0
     assert time.perf_counter() - began < 20.0
     assert "MB a minute" in capsys.readouterr().out
     assert "/arms/arm/key_points" in entities(tmp_path / "log.rrd")
+    beam = column(tmp_path / "log.rrd", "/beam", "LineStrips3D:strips")
+    ends = np.stack((log.arms["arm"].line_mm[:, -1], log.actual_mm), axis=1)
+    for row in range(log.rows):
+        np.testing.assert_allclose(beam[row][0], ends[row], atol=1e-4)
+    assert np.ptp(ends[:, 1, 2]) < 1e-3  # the plane is level
+    assert "beam from the tip to the plane" in legend(log)
+    assert "green" not in legend(recorded("track_circle", 3))
 
 
 def test_a_legend_names_only_the_colours_that_are_drawn(log, replay):

@@ -216,10 +216,11 @@ def live_blueprint(bench: LiveBench, end_s: float | None = None) -> rrb.Blueprin
             axis_x=last_seconds(WINDOW_S) if end_s is None else time_axis(end_s),
         )
 
+    actuation = "Pressure" if bench.unit == "kPa" else "Actuation"
     plots = [
         plot("residual", "Residual of each key point (mm)", "righttop"),
         plot("alarm", "Alarm level; 1: the model stopped holding", None),
-        plot("pressure", f"Pressure ({bench.unit}); darker: command", "righttop"),
+        plot("pressure", f"{actuation} ({bench.unit}); darker: command", "righttop"),
     ]
     if bench.tracks:
         plots.append(plot("tracking", "Error of the task (mm)", None))

@@ -62,6 +62,8 @@ LEGEND_TEXT = f"""- **white**: measured body
 - **red**: body that the model predicts
 - **points**: measured key points, {" to ".join(ERROR_NAMES)} from 0 to {LARGE_MM:g} mm of residual
 - **arrows**: error, from the measured to the predicted point, {STRETCH:g} times as long
+
+The alarm level begins when the reference of the change detector is complete.
 """
 
 

@@ -57,10 +57,12 @@ def dose_picture(threshold_j_per_mm2: float, cut_j_per_mm2: float, organ) -> byt
     marks: dict[float, str] = {}
     for value, text in ((threshold_j_per_mm2, "ablated"), (cut_j_per_mm2, "cut")):
         marks[value] = f"{marks[value]}, {text}" if value in marks else text
-    for value, text in marks.items():
+    for row, (value, text) in enumerate(marks.items()):  # one above the other: both are long
         side = "left" if value < 0.5 * most else "right"
         axis.axvline(value, color=INK, lw=1.5)
-        axis.text(value, 1.15, f"{text} from {value:.2g}", color=INK, fontsize=9, ha=side)
+        axis.text(
+            value, 1.15 + 0.5 * row, f"{text} from {value:.2g}", color=INK, fontsize=9, ha=side
+        )
     return _png(figure)
 
 

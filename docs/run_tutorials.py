@@ -18,6 +18,9 @@ folder; --write copies it, at most `MOST_PIXELS` wide.
 Each tutorial is a Jupyter notebook too, NAME.ipynb beside it, made of the page with the outputs and
 pictures that its run left: `bash` is a cell with `%%bash`, a file one with `%%writefile`.
 
+The gallery (docs/gallery) is run and renewed in the same way, but only when it is named, because it
+takes long. Its pictures of pages need Chromium, its pictures of replays a Vulkan driver.
+
 A guide (README.md and docs) runs in a folder with a recording, a model, a trained policy and the
 scenes; a block that begins with `# NAME.py` is also that file. Its lines for the shell are parsed
 by tests/test_docs.py: commands and options exist.
@@ -38,6 +41,8 @@ import time
 from pathlib import Path
 
 PAGES = Path(__file__).resolve().parent / "tutorials"
+GALLERY = PAGES.parent / "gallery" / "index.md"
+"""Pictures of tasks, replays and pages, each with the commands that made it."""
 MOST_PIXELS = 1000
 """Widest picture that is kept; all pictures together stay below 2 MB."""
 COLOURS = 128
@@ -86,8 +91,8 @@ def main(arguments: list[str]) -> int:
                 prepare(Path(folder))
                 run_guide(guide.read_text(), Path(folder), guide.name)
             print(f"{name}: {time.perf_counter() - began:.0f} s")
-    for page in tutorials():
-        if names and page.stem not in names:
+    for page in [*tutorials(), *([GALLERY] if "gallery" in names else [])]:
+        if names and page.stem not in names and page != GALLERY:
             continue
         began = time.perf_counter()
         with tempfile.TemporaryDirectory(prefix="tutorial-") as folder:
@@ -99,11 +104,12 @@ def main(arguments: list[str]) -> int:
                     print(f"{page.name}: no block made {name}", file=sys.stderr)
                     return 1
                 if write:
-                    keep(made, PAGES / "images" / name)
+                    keep(made, page.parent / "images" / name)
         if write:
             page.write_text(text)
-            write_notebook(page)
-        print(f"{page.name}: {time.perf_counter() - began:.0f} s")
+            if page != GALLERY:
+                write_notebook(page)
+        print(f"{page.relative_to(PAGES.parent)}: {time.perf_counter() - began:.0f} s")
     return 0
 
 
@@ -265,10 +271,12 @@ def not_installed(modules: str) -> list[str]:
 def shell(lines: str, folder: Path, page: str) -> str:
     """What lines print in bash."""
     with tempfile.TemporaryDirectory() as programs:
-        (Path(programs) / "surgisoft").write_text(
-            f'#!/bin/sh\nexec "{sys.executable}" -m surgisoft "$@"\n'
-        )
-        (Path(programs) / "surgisoft").chmod(0o755)
+        lines_of = {"surgisoft": f'exec "{sys.executable}" -m surgisoft "$@"'}
+        if (browser := shutil.which("chromium")) and getattr(os, "geteuid", lambda: 1)() == 0:
+            lines_of["chromium"] = f'exec "{browser}" --no-sandbox "$@"'  # root has no sandbox
+        for program, line in lines_of.items():
+            (Path(programs) / program).write_text(f"#!/bin/sh\n{line}\n")
+            (Path(programs) / program).chmod(0o755)
         path = f"{programs}{os.pathsep}{Path(sys.executable).parent}{os.pathsep}"
         done = subprocess.run(
             ["bash", "-euo", "pipefail", "-c", lines],

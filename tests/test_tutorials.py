@@ -3,9 +3,12 @@
 import base64
 import importlib.util
 import json
+import re
 from pathlib import Path
 
 import pytest
+
+from surgisoft.tasks.registry import TASKS
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 spec = importlib.util.spec_from_file_location("run_tutorials", DOCS / "run_tutorials.py")
@@ -154,3 +157,15 @@ def test_python_of_every_guide_is_run_or_says_why_not():
     run = {page.relative_to(DOCS.parent).as_posix() for page in tutorials.guides()}
     assert {"README.md", "docs/your_model.md", "docs/tasks.md"} <= run
     assert all((DOCS.parent / page).is_file() for page in tutorials.NOT_RUN)
+
+
+def test_the_gallery_has_every_task_and_the_command_of_each_picture():
+    text = tutorials.GALLERY.read_text()
+    shown, kept = tutorials.PICTURE.findall(text), [*(DOCS / "gallery" / "images").iterdir()]
+    assert {f"{name}.png" for name in TASKS} <= set(shown)
+    assert sorted(shown) == sorted(path.name for path in kept)
+    assert sum(path.stat().st_size for path in kept) < 3_000_000
+    for name in shown:
+        above = text[: text.index(f"](images/{name})")]
+        blocks = [block["body"] for block in tutorials.BLOCK.finditer(above)]
+        assert re.search(rf"--screenshot[= ]{re.escape(name)}\b", blocks[-1]), name

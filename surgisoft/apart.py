@@ -23,12 +23,16 @@ import numpy as np
 
 from surgisoft.errors import InputError
 
-MEMORY_BYTES = 4 << 30
+ADDRESS_BYTES = 4 << 30
 """Address space of the reading process, bytes; most of it is the libraries' own."""
+MEMORY_BYTES = 1 << 30
+"""Memory that the reading process may take for a file, bytes; on Linux alone."""
 MEMORY_PER_BYTE = 20
-"""Address space beyond that for each byte of the file."""
+"""Address space and memory beyond these for each byte of the file."""
 PATIENCE_S, PATIENCE_S_PER_MB = 4.0, 1.0
 """Longest processor time for reading a file, s, and s more for each MB of it."""
+STATM = Path("/proc/self/statm")
+"""Pages of memory of this process on Linux (proc(5)); the sixth number are data and stack."""
 REFUSED = 2
 """Exit status of a reading process that says in one line why it does not read the file."""
 
@@ -96,16 +100,19 @@ def unpacked(content: bytes) -> tuple[Any, list[np.ndarray]]:
 def limit(size: int) -> None:
     """Limit this process for a file of so many bytes, as far as the system can.
 
-    Address space, processor time, no core file. Windows has no limits, and macOS refuses one of the
-    address space.
+    Address space, memory beyond what the process has already, processor time, no core file. Windows
+    has no limits, and macOS refuses one of the address space.
     """
     try:
         import resource
     except ImportError:
         return
-    most = MEMORY_BYTES + MEMORY_PER_BYTE * size
+    more = MEMORY_PER_BYTE * size
     longest_s = math.ceil(time.process_time() + PATIENCE_S + PATIENCE_S_PER_MB * 1e-6 * size)
-    wanted = ((resource.RLIMIT_AS, most), (resource.RLIMIT_CPU, longest_s))
+    wanted = [(resource.RLIMIT_AS, ADDRESS_BYTES + more), (resource.RLIMIT_CPU, longest_s)]
+    if STATM.is_file():  # only Linux counts mapped memory in RLIMIT_DATA
+        own = int(STATM.read_text().split()[5]) * resource.getpagesize()
+        wanted.append((resource.RLIMIT_DATA, own + MEMORY_BYTES + more))
     for kind, value in (*wanted, (resource.RLIMIT_CORE, 0)):
         hard = resource.getrlimit(kind)[1]
         value = value if hard == resource.RLIM_INFINITY else min(value, hard)

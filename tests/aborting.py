@@ -31,4 +31,6 @@ def as_bytes(path):
                 pass
         case "memory":
             np.ones(1 << 32)
+        case "more memory than a small file needs":
+            np.ones(3 << 26)
     return packed({"path": path.name}, np.arange(3.0), np.array([[1, 2]]))

@@ -1,6 +1,7 @@
 """Reading in a process of its own: whatever its end, it is one line here."""
 
 import signal
+import sys
 
 import numpy as np
 import pytest
@@ -30,6 +31,11 @@ def test_what_is_read_comes_back(tmp_path):
         ("segmentation fault", "cannot be read as a test's file (its process ended with status -"),
         ("exception", "cannot be read as a test's file (last line)"),
         ("memory", "Unable to allocate 32.0 GiB"),
+        pytest.param(
+            "more memory than a small file needs",
+            "Unable to allocate 1.50 GiB",
+            marks=pytest.mark.skipif(sys.platform != "linux", reason="Linux alone limits it"),
+        ),
         ("refused", "has no frame; expected one"),
     ],
 )

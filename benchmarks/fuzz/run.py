@@ -41,7 +41,8 @@ class Limits:
     memory_bytes: int = 1 << 30
     """Address space beyond that of a worker which has read the valid files."""
     batch_s: float = 60.0
-    """Time of one worker, s, of which it imports what it needs for a few."""
+    """Processor time for which one worker reads, s: on a busy machine it would spend most of a wall
+    time on importing what it needs."""
     message: int = 1000
     """Longest message, characters."""
 
@@ -236,6 +237,10 @@ class Batch:
             "findings": findings,
         }
 
+    def _goes_on(self, began: float) -> bool:
+        """Whether this worker reads another input; began: processor time before its first one."""
+        return time.monotonic() < self.end and _used_s() - began < self.limits.batch_s
+
     def _lines(self) -> list[str]:
         file = self.out / "findings.jsonl"
         return file.read_text().splitlines() if file.is_file() else []
@@ -254,8 +259,8 @@ class Batch:
             target.read(sample)
         with (self.out / "findings.jsonl").open("w") as file:
             _limit(self.limits)
-            number, end = self.first, min(self.end, time.monotonic() + self.limits.batch_s)
-            while time.monotonic() < end and number != self.last and os.getppid() == parent:
+            number, began = self.first, _used_s()
+            while self._goes_on(began) and number != self.last and os.getppid() == parent:
                 self.now[:16] = struct.pack("<qd", number, time.monotonic())
                 with inputs.put(number) as sample:
                     signal.setitimer(signal.ITIMER_PROF, self.limits.hang_s)
@@ -266,6 +271,11 @@ class Batch:
                     file.flush()
                 number += 1
             self.now[:16] = struct.pack("<qd", number, time.monotonic())
+
+
+def _used_s() -> float:
+    """Processor time of this process and of its children that have ended, s."""
+    return sum(os.times()[:4])
 
 
 def _limit(limits: Limits) -> None:

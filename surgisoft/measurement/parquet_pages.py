@@ -73,8 +73,11 @@ def check_claim(path: Path, claimed: int, what: str) -> None:
 
 def _check(path: Path, data: mmap.mmap) -> None:
     """Raise InputError or ValueError where the pages claim too much or lie outside of the file."""
-    unpacked = values = 0
+    unpacked = values = covered = 0
     for chunk in _chunks(data):
+        covered += chunk.end - chunk.begin
+        if covered > len(data):  # each byte would be read once for each chunk that claims it
+            raise ValueError("column chunks that overlap")
         values += max(chunk.values, 0)
         check_claim(path, 8 * values, f"{values} values")
         for size in _page_sizes(chunk, data):

@@ -8,12 +8,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from scipy.io import savemat
 
 from benchmarks.fuzz.targets import make_c3d, make_matlab
 from surgisoft import apart
 from surgisoft.cli import run
 from surgisoft.errors import InputError
 from surgisoft.measurement.importing import READERS, RawTable, Reader, import_files, load_map
+from surgisoft.measurement.importing.readers import arrays
 
 MAP = """\
 [file.log]
@@ -307,6 +309,24 @@ def test_what_ends_a_library_is_one_line(tmp_path, make, file, changes):
     path.write_bytes(content)
     with pytest.raises(InputError, match=f"{path.name}: cannot be read as a .* file"):
         import_files([path], load_map(str(path.parent / "map.toml")), "r")
+
+
+@pytest.mark.parametrize("ending", ["mat", "h5"])
+def test_packed_numbers_take_no_gigabytes(tmp_path, monkeypatch, ending):
+    """Zeros of one byte each, 200 kB packed in less than 10 kB, become 1.6 MB of real numbers."""
+    h5py = pytest.importorskip("h5py", reason="the extra 'lab' is not installed")
+    path, zeros = tmp_path / f"raw.{ending}", np.zeros(200_000, np.uint8)
+    if ending == "mat":
+        savemat(path, {"t": zeros}, do_compression=True)
+    else:
+        with h5py.File(path, "w") as file:
+            file.create_dataset("t", data=zeros, compression="gzip")
+    assert path.stat().st_size < 10_000
+    monkeypatch.setattr(arrays, "MOST_UNPACKED", 1 << 20)
+    with pytest.raises(InputError, match=r"raw\..* holds 1600000 bytes of numbers, packed in"):
+        arrays.as_bytes(path)
+    monkeypatch.setattr(arrays, "MOST_UNPACKED", 1 << 21)
+    assert arrays.as_bytes(path)
 
 
 def test_an_hdf5_file_cannot_claim_gigabytes_or_other_files(tmp_path):

@@ -269,6 +269,21 @@ def test_damaged_statistics_of_sizes_do_not_end_the_process(tmp_path):
     assert "not a readable Parquet file" in error_of(path)
 
 
+def test_column_chunks_do_not_overlap(tmp_path):
+    """A footer may state thousands of chunks in the same bytes, which would be read each time."""
+    path, names = tmp_path / "bad.parquet", HEAD.split(",")
+    table = pa.table([np.zeros(20_000)] * len(names), names=names)
+    pq.write_table(table, path, use_dictionary=False, compression="none")
+    assert "Parquet" not in error_of(path)
+    content = path.read_bytes()
+    sizes = re.compile(rb"(\x16([\x80-\xff]{2}[\x01-\x7f])\x16)\2(\x26)")  # fields 6, 7, 9
+    larger = b"\xfe\xff\x1f"  # 2**18 - 1 in the same three bytes, of 160 kB
+    bad, changed = sizes.subn(lambda found: found[1] + larger + found[3], content, 1)
+    assert changed == 1
+    path.write_bytes(bad)
+    assert "not a readable Parquet file" in error_of(path)
+
+
 def test_a_list_in_the_header_of_a_page_ends_with_the_file(tmp_path):
     """A header may claim a list of 2**42 truth values, which take no time to pass over."""
     path, names = tmp_path / "bad.parquet", HEAD.split(",")

@@ -70,7 +70,18 @@ def _apart(path: Path, role: FileRole, what: str) -> RawTable:
 def as_bytes(path: Path) -> bytes:
     """Paths and arrays of a file; SciPy and HDF5 may end the process on a damaged one."""
     found = dict(_hdf5(path) if _is_hdf5(path) else _matlab(path))
+    size, held = path.stat().st_size, sum(array.nbytes for array in found.values())
+    if held > _most(size):
+        raise InputError(
+            f"{path}: holds {held} bytes of numbers, packed in {size}; expected a file with "
+            "measurements, which do not compress as much"
+        )
     return packed(list(found), *found.values())
+
+
+def _most(size: int) -> int:
+    """Most bytes of numbers that are taken from a file of so many bytes."""
+    return max(MOST_UNPACKED, MOST_PACKED * size)
 
 
 def _matlab(path: Path) -> Iterator[tuple[str, np.ndarray]]:
@@ -92,7 +103,7 @@ def _hdf5(path: Path) -> Iterator[tuple[str, np.ndarray]]:
     import h5py
 
     found: list[tuple[str, np.ndarray]] = []
-    left = max(MOST_UNPACKED, MOST_PACKED * path.stat().st_size)
+    left = _most(path.stat().st_size)
 
     def visit(name: str, item: Any) -> None:
         nonlocal left

@@ -26,6 +26,15 @@ def test_a_dependency_is_compatible_with_mit(package):
     assert listed, "python -m benchmarks.supply_chain licences > docs/licences.md"
 
 
+def test_the_list_of_licences_is_one_table_in_the_order_of_names():
+    head, row, table = (ROOT / "docs" / "licences.md").read_text().partition("\n|---|---|---|\n")
+    assert row
+    assert head.count("|") == 4, "only the names of the columns"
+    names = re.findall(r"^\| (\S+) \|", table, re.M)
+    assert len(names) >= len(INSTALLED)
+    assert names == sorted(names)
+
+
 def test_dependencies_of_dependencies_are_among_them():
     names = {package.name for package in INSTALLED}
     assert {"torch", "numpy", "llvmlite", "mpmath", "markdown-it-py"} <= names

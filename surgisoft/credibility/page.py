@@ -6,6 +6,7 @@ import numpy as np
 
 from surgisoft.credibility.assessment import STATEMENT, Assessment, PointError
 from surgisoft.credibility.domain import NEAR, NEAR_POSE, Applicability, percent
+from surgisoft.credibility.factors import factors
 from surgisoft.files import write_json
 from surgisoft.report import Facts, Gallery, Page, Picture, Section, Share, Table, Text, write_page
 from surgisoft.report.charts import AMBER, BLUE, CHART, GREEN, RED, chart, drawing
@@ -59,6 +60,7 @@ def credibility_page(found: Assessment) -> Page:
             Text(STATEMENT),
             _question(found),
             _criteria(found),
+            _factors(found),
             _error(found),
             _uncertainty(found),
             _comparators(found),
@@ -128,6 +130,18 @@ def _criteria(found: Assessment) -> Section | None:
         rows.append((each.name, value, f"{sign} {number(each.limit)}", met))
     header = ["criterion", "value", "limit", "result"]
     return Section("Acceptance criteria", [Table(header, rows)])
+
+
+def _factors(found: Assessment) -> Section:
+    rows = [
+        (each.activity, each.name, each.evidence, each.section or "-") for each in factors(found)
+    ]
+    text = (
+        "The credibility factors of ASME V&V 40-2018, with what this report says about each. The "
+        "goal of each factor follows from the model risk and is set by the user."
+    )
+    header = ["activity", "credibility factor", "in this report", "section"]
+    return Section("Credibility factors", [Text(text), Table(header, rows)])
 
 
 def _error(found: Assessment) -> Section:

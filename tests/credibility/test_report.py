@@ -76,6 +76,21 @@ def test_the_report_has_what_both_standards_ask_for(bench):
     assert found["applicability"]["share"] == 1.0  # its own states
     assert found["passed"] is all(each["passed"] for each in found["criteria"])
     assert found["software"]["surgisoft"]
+    factors = {each["name"]: each for each in found["credibility_factors"]}
+    assert len(factors) == 13
+    assert not factors["numerical code verification"]["assessed"]  # the context names no episode
+    domain = factors["relevance of the validation activities to the context of use"]
+    assert domain["evidence"] == found["applicability"]["sentence"]
+    assert f"U_val {body['uncertainty_mm']:.3g} mm" in factors["output comparison"]["evidence"]
+    assert factors["test samples"]["evidence"] == "recordings: 1; robots: 1 stated"
+
+
+def test_every_factor_names_a_section_of_the_report(bench):
+    found = json.loads((bench / "report/credibility.json").read_text())
+    titles = re.findall(r"<h2[^>]*>([^<]+)</h2>", (bench / "report/credibility.html").read_text())
+    named = {each["section"] for each in found["credibility_factors"]} - {""}
+    assert named <= set(titles)
+    assert "Credibility factors" in titles
 
 
 def test_the_page_says_it_and_escapes_what_the_user_wrote(bench, tmp_path):

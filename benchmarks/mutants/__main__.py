@@ -1,43 +1,26 @@
-"""`python -m benchmarks.mutants`: run the tests of each mutant, list those that none notices.
-
-The tests run in processes that are forked from one in which the libraries are imported already. The
-test that noticed a mutant in the last run, according to the page of results, runs first. At the end
-the tests that noticed something run on the source as it is: a mutant whose test fails there too is
-"unknown", because that test shows nothing.
-"""
+"""`python -m benchmarks.mutants`: run the tests of each mutant, list those that none notices."""
 
 import argparse
 import datetime
-import importlib.util
 import json
-import os
 import re
 import shutil
-import signal
 import sys
 import tempfile
-import time
-import types
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
-from benchmarks.mutants import Mutant, mutants, mutated
+from benchmarks.mutants import Mutant, mutants
+from benchmarks.mutants.run import failing, key_of, prepare, run
 
 ROOT = Path(__file__).resolve().parents[2]
 COPIED = ("benchmarks", "docs", "scenes", "surgisoft", "tests", "pyproject.toml", "setup.py")
 COPIED += ("README.md", "CONTRIBUTING.md", "Makefile", "mkdocs.yml", "constraints.txt")
-LONGEST_S = 900
-"""Time after which the tests of a mutant are ended: a hang is noticed, too, s."""
 PAGE = ROOT / "docs" / "results" / "mutants.md"
 """The page of results of the last run."""
 ROW = re.compile(r"\| (.+?)(?: \(\*\))? \| `[^`]+` \| \w+ \| `(.+)` \|")
 """Its rows: the mutant, and the test that noticed it."""
-LIBRARIES = ("numpy", "scipy.optimize", "scipy.stats", "scipy.spatial", "pandas", "pyarrow.parquet")
-LIBRARIES += ("numba", "torch", "tensordict", "trimesh", "pytest", "hypothesis", "rerun")
-"""What is imported once, before the first process is forked."""
-OURS = ("benchmarks", "surgisoft", "tests")
-"""Packages of the tree, which each process imports from the changed copy."""
 
 
 def main() -> int:
@@ -54,11 +37,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         tree = Path(folder) / "tree"
         _copy(tree)
-        os.environ |= {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
-        os.environ["SURGISOFT_SHARED"] = "/nonexistent"
-        for name in LIBRARIES:
-            if importlib.util.find_spec(name.split(".")[0]):
-                importlib.import_module(name)
+        prepare(tree)
         for mutant in some:
             if mutant.name in outcomes:
                 continue
@@ -89,12 +68,8 @@ def _known(log: Path | None, some: Iterable[Mutant]) -> dict[str, dict]:
     if log is None or not log.is_file():
         return {}
     found = [json.loads(line) for line in log.read_text().splitlines()]
-    keys = {mutant.name: _key(mutant) for mutant in some}
+    keys = {mutant.name: key_of(mutant) for mutant in some}
     return {row["name"]: row for row in found if keys.get(row["name"]) == row["key"]}
-
-
-def _key(mutant: Mutant) -> list[str]:
-    return [mutant.file, mutant.old, mutant.new]
 
 
 def _copy(tree: Path) -> None:
@@ -105,80 +80,6 @@ def _copy(tree: Path) -> None:
             shutil.copytree(ROOT / name, tree / name, ignore=ignored)
         else:
             shutil.copy2(ROOT / name, tree / name)
-
-
-def run(mutant: Mutant, tree: Path, first: str | None) -> dict:
-    """Apply a mutant to a tree, run its tests until one fails, and undo it.
-
-    first: the test that is run before the others.
-    """
-    file, began = tree / mutant.file, time.monotonic()
-    text = file.read_text()
-    file.write_text(mutated(mutant, text))
-    try:
-        code, failed = 0, []
-        if first is not None:
-            code, failed = run_tests(tree, ["-x", first])
-        if code != 1:  # it did not notice, or is no more
-            code, failed = run_tests(tree, ["-x", *mutant.tests])
-    finally:
-        file.write_text(text)
-    return {
-        "name": mutant.name,
-        "key": _key(mutant),
-        "outcome": {0: "survived", 1: "caught"}.get(code, "broken"),
-        "by": failed[0] if failed else "",
-        "seconds": round(time.monotonic() - began, 1),
-    }
-
-
-def failing(outcomes: Iterable[dict], tree: Path) -> set[str]:
-    """Those of the tests that noticed a mutant which also fail on the source as it is."""
-    tests = sorted({outcome["by"] for outcome in outcomes if "::" in outcome["by"]})
-    return set(run_tests(tree, tests, LONGEST_S * 4)[1]) if tests else set()
-
-
-def run_tests(
-    tree: Path, arguments: Sequence[str], longest_s: float = LONGEST_S
-) -> tuple[int, list[str]]:
-    """pytest in a forked process: its exit code, or 1 after that time, and what failed."""
-    with tempfile.TemporaryFile() as out:
-        pid = os.fork()
-        if pid == 0:
-            try:
-                os.setsid()
-                os.dup2(out.fileno(), 1)
-                os.dup2(out.fileno(), 2)
-                _pytest(tree, arguments)
-            finally:
-                os._exit(70)
-        end = time.monotonic() + longest_s
-        while not (ended := os.waitpid(pid, os.WNOHANG))[0]:
-            if time.monotonic() > end:
-                os.killpg(pid, signal.SIGKILL)
-                os.waitpid(pid, 0)
-                return 1, ["the tests did not end"]
-            time.sleep(0.05)
-        out.seek(0)
-        said = out.read().decode("utf-8", "replace")
-    lines = [line.split(" - ")[0].partition(" ") for line in said.splitlines()]
-    failed = [rest for word, _, rest in lines if word in ("FAILED", "ERROR")]
-    return os.waitstatus_to_exitcode(ended[1]), failed
-
-
-def _pytest(tree: Path, arguments: Sequence[str]) -> None:
-    """Run pytest in this process on the packages of a tree, and end the process."""
-    import pytest
-
-    for name in [name for name in sys.modules if name.split(".")[0] in OURS]:
-        del sys.modules[name]
-    sys.modules["__main__"] = types.ModuleType("__main__")  # processes that tests start import it
-    os.chdir(tree)
-    sys.path[:] = [str(tree), *(path for path in sys.path if path not in ("", str(ROOT)))]
-    options = ["-q", "-n", "0", "-p", "no:cacheprovider", "--tb=no"]
-    code = pytest.main([*options, *arguments])
-    sys.stdout.flush()
-    os._exit(int(code))
 
 
 def markdown(some: list[Mutant], outcomes: dict[str, dict]) -> str:

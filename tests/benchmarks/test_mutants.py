@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.mutants import Mutant, mutants, mutated
+from benchmarks.mutants.run import failing, run
 
 ROOT = Path(__file__).resolve().parents[2]
 ALL = mutants()
@@ -32,3 +33,34 @@ def test_a_text_that_is_not_there_once_does_not_apply():
     for text in ("b", "aa"):
         with pytest.raises(ValueError, match="expected once"):
             mutated(mutant, text)
+
+
+@pytest.fixture
+def tree(tmp_path):
+    """A project with two values and two tests, of which one looks at a value."""
+    (tmp_path / "surgisoft").mkdir()
+    (tmp_path / "surgisoft" / "__init__.py").write_text("A = 1\nB = 2\n")
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests" / "test_values.py").write_text(
+        "import surgisoft\n\ndef test_a():\n    assert surgisoft.A == 1\n\n"
+        "def test_b():\n    assert surgisoft.B\n"
+    )
+    return tmp_path
+
+
+@pytest.mark.parametrize("first", [None, "tests/test_values.py::test_a", "tests/gone.py::test_c"])
+def test_a_survivor_is_told_from_a_caught_one(tree, first):
+    """The changed copy is imported, not the package that this process has imported."""
+    file, tests = "surgisoft/__init__.py", ("tests/test_values.py",)
+    caught = run(Mutant("x", "y", file, "A = 1", "A = 3", tests), tree, first)
+    assert (caught["outcome"], caught["by"]) == ("caught", "tests/test_values.py::test_a")
+    survived = run(Mutant("x", "y", file, "B = 2", "B = 3", tests), tree, first)
+    assert (survived["outcome"], survived["by"]) == ("survived", "")
+    assert (tree / file).read_text() == "A = 1\nB = 2\n"
+
+
+def test_a_test_that_fails_without_a_mutant_is_found(tree):
+    (tree / "tests" / "test_broken.py").write_text("def test_c():\n    assert False\n")
+    noticed = ("tests/test_values.py::test_a", "tests/test_broken.py::test_c", "")
+    outcomes = [{"by": test} for test in noticed]
+    assert failing(outcomes, tree) == {"tests/test_broken.py::test_c"}

@@ -50,8 +50,8 @@ def main() -> None:
     count = options.parse_args().envs
     env = surgisoft.batched_env("circle_ablation", count)
     for _ in range(APPROACH_STEPS):
-        env.step(env.task.script(env._state))
-    state, engine = env._state.world, env.task.world.scene
+        env.step(env.task.script(env.task_state))
+    state, engine = env.task_state.world, env.task.world.scene
     eye = state.arms["endoscope"]
     poses = frames.pose_from_z(eye.tip_mm.double(), eye.tip_direction.double()).numpy()
     radii = engine.geometry.radii_mm

@@ -344,3 +344,40 @@ def test_what_windows_lacks_is_asked_for():
     assert unguarded("def f():\n    if sys.platform == 'linux':\n        os.fork()") == []
     needs = {str(path): unguarded(path.read_text()) for path in PACKAGE.rglob("*.py")}
     assert {path: found for path, found in needs.items() if found} == {}
+
+
+BY_NAME = ("setattr", "delattr", "getattr", "hasattr")
+"""Functions that take the name of an attribute as text, also those of pytest's `monkeypatch`."""
+OF_LIBRARIES = ("_replace", "_repr_html_", "_exit", "_protected_args")
+"""Names with an underscore that are not the project's: named tuples, IPython, `os`, Click."""
+
+
+def private_names(source: str) -> list[str]:
+    """Names that begin with an underscore, are of something imported, and occur in a test."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        match node:
+            case ast.Attribute(value=ast.Name(id="self" | "cls")):
+                continue  # of a class that the test itself makes
+            case ast.Attribute(attr=name):
+                found.append(name)
+            case ast.ImportFrom(names=names):
+                found += [each.name for each in names]
+            case ast.Call(func=of) if ast.unparse(of).rpartition(".")[2] in BY_NAME:
+                texts = [each.value for each in node.args if isinstance(each, ast.Constant)]
+                found += [str(text).rpartition(".")[2] for text in texts]
+    own = [name for name in found if name.isidentifier() and name not in OF_LIBRARIES]
+    return [name for name in own if name.startswith("_") and not name.startswith("__")]
+
+
+def test_no_test_uses_a_private_name():
+    for path in sorted((ROOT / "tests").rglob("*.py")):
+        assert private_names(path.read_text()) == [], path
+    for line in (
+        "a._b()",
+        "from a import _b",
+        "patch.setattr(a, '_b', 1)",
+        "patch.setattr('a._b')",
+    ):
+        assert private_names(line) == ["_b"]
+    assert private_names("self._b = __name__") == []

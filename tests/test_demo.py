@@ -68,7 +68,7 @@ def test_what_ends_early_leaves_whole_steps_or_nothing(tmp_path, monkeypatch, fa
     log, parts = object(), [Text("the cut"), Text("left out")]
     cut = SimpleNamespace(logs={"ring": log})
     monkeypatch.setattr(story, "evaluate", lambda *_, **__: cut)
-    monkeypatch.setattr(story, "_cut_sentence", lambda cut: "the whole ring was cut")
+    monkeypatch.setattr(story, "cut_sentence", lambda cut: "the whole ring was cut")
     monkeypatch.setattr(story, "episode_parts", lambda log: parts)
     monkeypatch.setattr(story, "open_replay", none)
     monkeypatch.setattr(story, "write_replay", none if failing == "replay" else lambda *_: None)

@@ -119,7 +119,7 @@ def _five_steps(
     picture, no_picture = _replay_picture(folder / "cut.rrd", folder / "cut.png")
     story.tell(
         f"evaluate {policy} --episodes 1 --replay cut.rrd",
-        _cut_sentence(cut),
+        cut_sentence(cut),
         _cut_parts(log, picture),
     )
 
@@ -301,7 +301,8 @@ def _amended_parts(amendment: Amendment | None) -> list[Part]:
     ]
 
 
-def _cut_sentence(cut: Evaluations) -> str:
+def cut_sentence(cut: Evaluations) -> str:
+    """What the episode of one policy came to, in words."""
     (result,) = cut.results
     numbers = {name: value.mean for name, value in result.overall.items()}
     whole = numbers["success"] == 1.0

@@ -86,8 +86,10 @@ class Emulator:
         """Clock of the cameras ahead of the controller's [s]."""
         self.vents = 0
         """Times that the valves were opened, by request or by the watchdog."""
+        self.number = 0
+        """Number of the last frame."""
         self._target = vented(self.rig.limits)
-        self._seq, self._heard_ms, self._lines, self._number = 0, 0.0, 0, 0
+        self._seq, self._heard_ms, self._lines = 0, 0.0, 0
         self._names = {k + 1: f"k{k}" for k in range(self.rig.key_planes)}
         self._natnet = natnet_version
         self._group = multicast
@@ -249,7 +251,7 @@ class Emulator:
 
     def _show(self, now_s: float, sample: Sample) -> None:
         """Send a frame of the cameras."""
-        self._number += 1
+        self.number += 1
         names = list(range(self.rig.key_planes))
         if self.exchanged:
             i, j = self.exchanged
@@ -258,16 +260,16 @@ class Emulator:
             f"k{name}": np.full(3, np.nan) if k in self.occluded else sample.key_points_mm[k]
             for k, name in enumerate(names)
         }
-        if self.blind or self._number in self.skipped:
+        if self.blind or self.number in self.skipped:
             return
         t_s = now_s + self.clock_ahead_s
         if not self._natnet:
-            frame = Frame(self._number, t_s, dict(sorted(points.items())), {})
+            frame = Frame(self.number, t_s, dict(sorted(points.items())), {})
             self._sender.sendto(encode_json(frame), (LOOPBACK, self.mocap_port))
             return
         still = np.array([0.0, 0.0, 0.0, 1.0])
         bodies = {name: Body(at, still) for name, at in sorted(points.items())}
-        packet = encode_frame(Frame(self._number, t_s, {}, bodies), self._natnet, self._names)
+        packet = encode_frame(Frame(self.number, t_s, {}, bodies), self._natnet, self._names)
         for client in self._clients if not self._group else {(self._group, self.data_port)}:
             with contextlib.suppress(OSError):
                 self._sender.sendto(packet, client)

@@ -283,7 +283,7 @@ class AblationMap:
         sums = [state.dose, state.peak, state.band_mm2, state.zone_mm2, state.zone_j]
         if not in_place:
             sums = [t.clone() for t in sums]
-        deposit = self._deposit if self.device.type == "cpu" else self._deposit_torch
+        deposit = self.deposit_compiled if self.device.type == "cpu" else self.deposit_torch
         for began_of, ended_of, along, joule in _each_beam(began, ended, middle, energy):
             sums = [*deposit(began_of, ended_of, along, joule, state.ring, *sums)]
         dose, peak, band, area, zone_j = sums
@@ -304,7 +304,15 @@ class AblationMap:
         held = finite[..., None]
         return torch.where(held, point, 0.0), torch.where(held, aim, 0.0), on & finite
 
-    def _deposit(self, began, ended, direction, energy, ring, dose, peak, band, area, joule):
+    def deposit_compiled(
+        self, began, ended, direction, energy, ring, dose, peak, band, area, joule
+    ):
+        """Dose, peak, band, area and energy of a state after one beam of each environment.
+
+        It is compiled and changes these arrays in place. began, ended: (B, 3) the beam's ends in
+        the organ's frame, mm; direction: (B, 3) unit vectors; energy: (B,) J; the rest are fields
+        of an `AblationState`.
+        """
         patch, grid = self.patch, self.patch.buckets
         beams = [t.contiguous().numpy() for t in (began, ended, direction, energy)]
         kept = [t.numpy() for t in (dose, peak, band, area, joule)]
@@ -314,8 +322,8 @@ class AblationMap:
         _deposit(*beams, which, self.waist_mm, self._counted, samples, place, *kept)
         return dose, peak, band, area, joule
 
-    def _deposit_torch(self, began, ended, direction, energy, ring, dose, peak, band, area, joule):
-        """`_deposit` in torch, for accelerators: every sample, a few environments at a time."""
+    def deposit_torch(self, began, ended, direction, energy, ring, dose, peak, band, area, joule):
+        """`deposit_compiled` in torch, for accelerators, with all samples and nothing in place."""
         points, normals, areas = (t.float() for t in self._samples)
         size = max(1, 8_000_000 // len(points))
         for i in range(0, len(dose), size):

@@ -41,31 +41,32 @@ class SurgicalEnv(ParallelEnv):
             "is_parallelizable": True,
         }
         self.render_mode, self._pictures = render_mode, Pictures(task, render_mode)
-        self.task, self._adapter = task, NumpyAdapter(task)
+        self.task, self.adapter = task, NumpyAdapter(task)
         self._batch: TaskState | None = None
-        self._lone: LoneEpisode | None = None
+        self.lone: LoneEpisode | None = None
+        """What advances the episode in place of the adapter, where the task has such a thing."""
         self.possible_agents = list(task.agents)
         self.agents: list[str] = []
-        self._observed = {a: self._adapter.observation_space(a) for a in task.agents}
-        self._acted = {a: Box(*self._adapter.action_bounds(a)) for a in task.agents}
-        each = [Box(*self._adapter.observation_bounds(a)) for a in task.agents]
+        self._observed = {a: self.adapter.observation_space(a) for a in task.agents}
+        self._acted = {a: Box(*self.adapter.action_bounds(a)) for a in task.agents}
+        each = [Box(*self.adapter.observation_bounds(a)) for a in task.agents]
         low = np.concatenate([box.low for box in each])
         self.state_space = Box(low, -low)
 
     def __getstate__(self) -> dict[str, Any]:
         """A copy's state: arrays that share memory with one another cannot be copied one by one."""
-        return {**self.__dict__, "_batch": self._state, "_lone": self._lone is not None}
+        return {**self.__dict__, "_batch": self.task_state, "lone": self.lone is not None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Go on from a copy's state."""
         self.__dict__.update(state)
         batch = self._batch
-        self._lone = self._adapter.alone(batch) if state["_lone"] and batch is not None else None
+        self.lone = self.adapter.alone(batch) if state["lone"] and batch is not None else None
 
     @property
-    def _state(self) -> TaskState | None:
+    def task_state(self) -> TaskState | None:
         """State of the episode, a batch of one; None before the first reset."""
-        return self._batch if self._lone is None else self._lone.state
+        return self._batch if self.lone is None else self.lone.state
 
     def observation_space(self, agent: str) -> Box | DictSpace:
         """The Box of an agent's observation (D,); with images a Dict of it and of their Boxes."""
@@ -80,12 +81,12 @@ class SurgicalEnv(ParallelEnv):
 
         Without a seed the random number stream of the last episode continues.
         """
-        state = self._state
+        state = self.task_state
         if seed is None and state is not None:
-            self._batch = self._adapter.restart(state)
+            self._batch = self.adapter.restart(state)
         else:
-            self._batch = self._adapter.seeded([entropy_seed() if seed is None else seed])
-        self._lone = self._adapter.alone(self._batch)
+            self._batch = self.adapter.seeded([entropy_seed() if seed is None else seed])
+        self.lone = self.adapter.alone(self._batch)
         self.agents = list(self.possible_agents)
         return self._observations(), {agent: {} for agent in self.agents}
 
@@ -101,10 +102,10 @@ class SurgicalEnv(ParallelEnv):
         absent = [agent for agent in self.agents if agent not in actions]
         if absent:
             raise InputError(f"no action for {', '.join(absent)}: expected one for each live agent")
-        if self._lone is not None:
-            return self._lone_step(self._lone, actions)
+        if self.lone is not None:
+            return self._lone_step(self.lone, actions)
         held = {agent: np.asarray(actions[agent])[None] for agent in self.agents}
-        self._batch, outcome = self._adapter.step(self._batch, held)
+        self._batch, outcome = self.adapter.step(self._batch, held)
         measures = {
             name: value.item() for name, value in outcome.measures.items() if value.isfinite().all()
         }
@@ -123,7 +124,7 @@ class SurgicalEnv(ParallelEnv):
 
     def _lone_step(self, lone: LoneEpisode, actions: dict):
         """`step` where the task advances its only environment without tensors."""
-        lone.step(self._adapter.checked(actions))
+        lone.step(self.adapter.checked(actions))
         measures = {name: value for name, value in lone.measures.items() if math.isfinite(value)}
         terms, live = lone.terms, self.agents
         infos = {agent: {**terms[agent], **measures} for agent in live}
@@ -137,26 +138,26 @@ class SurgicalEnv(ParallelEnv):
 
     def state(self) -> np.ndarray:
         """(sum of D,) the concatenated vectors of all agents, for centralised critics."""
-        if self._lone is not None:
-            seen = self._lone.observations
+        if self.lone is not None:
+            seen = self.lone.observations
             return np.concatenate([seen[agent] for agent in self.possible_agents])
         if self._batch is None:
             raise InputError("state before reset: call reset() first")
-        seen = self._adapter.vectors(self._batch)
+        seen = self.adapter.vectors(self._batch)
         return np.concatenate([seen[agent][0] for agent in self.possible_agents])
 
     def render(self) -> np.ndarray | None:
         """(H, W, 3) uint8: the present state from outside; None without a render mode."""
-        return self._pictures.of(self._state)
+        return self._pictures.of(self.task_state)
 
     def close(self) -> None:
         """Do nothing: the environment holds no resources."""
 
     def _observations(self) -> dict[str, Any]:
-        if self._lone is not None:
-            return self._lone.observations
+        if self.lone is not None:
+            return self.lone.observations
         assert self._batch is not None, "there is one after a reset"
-        seen = self._adapter.observations(self._batch)
+        seen = self.adapter.observations(self._batch)
         return {agent: in_one(seen[agent]) for agent in self.agents}
 
 

@@ -62,21 +62,21 @@ GROUP = "surgisoft.tasks"
 
 def task_names() -> list[str]:
     """Names of all tasks: those of this package, then those that installed packages offer."""
-    return [*TASKS, *(name for name in _offered(tuple(sys.path)) if name not in TASKS)]
+    return [*TASKS, *(name for name in offered(tuple(sys.path)) if name not in TASKS)]
 
 
 def spec_of(task: str) -> TaskSpec:
     """The named task's entry; an unknown name raises an InputError that lists the known ones."""
     if task in TASKS:
         return TASKS[task]
-    entry = _offered(tuple(sys.path)).get(task)
+    entry = offered(tuple(sys.path)).get(task)
     if entry is None:
         raise unknown_name("task", task, task_names())
     return _loaded(entry)
 
 
 @functools.cache
-def _offered(path: tuple[str, ...]) -> dict[str, EntryPoint]:
+def offered(path: tuple[str, ...]) -> dict[str, EntryPoint]:
     """Entry points of tasks by name while the search path is this one; none is loaded."""
     return {entry.name: entry for entry in entry_points(group=GROUP)}
 

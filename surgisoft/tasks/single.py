@@ -119,22 +119,22 @@ class SingleEnv(gymnasium.Env):
         `parallel_env`.
         """
         shown = (agent, images, image_pixels)
-        self._adapter, self._agent = _adapter(task, config, device, scene, arm, geometry, *shown)
-        self._pictures = Pictures(self._adapter.task, render_mode)
+        self.adapter, self._agent = _adapter(task, config, device, scene, arm, geometry, *shown)
+        self._pictures = Pictures(self.adapter.task, render_mode)
         self.render_mode = render_mode
-        fps = round(1.0 / self._adapter.task.world.config.dt_s)
+        fps = round(1.0 / self.adapter.task.world.config.dt_s)
         self.metadata = {**self.metadata, "render_fps": fps}
         self._state: TaskState | None = None
-        self.observation_space = self._adapter.observation_space(self._agent)
-        self.action_space = Box(*self._adapter.action_bounds(self._agent))
+        self.observation_space = self.adapter.observation_space(self._agent)
+        self.action_space = Box(*self.adapter.action_bounds(self._agent))
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Start an episode; returns (observation, empty info)."""
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(2**63))
-        self._state = self._adapter.seeded([seed])
-        return in_one(self._adapter.observations(self._state)[self._agent]), {}
+        self._state = self.adapter.seeded([seed])
+        return in_one(self.adapter.observations(self._state)[self._agent]), {}
 
     def step(self, action: np.ndarray):
         """Advance one step: (observation, reward, terminated, truncated, info).
@@ -143,13 +143,13 @@ class SingleEnv(gymnasium.Env):
         """
         if self._state is None:
             raise InputError("step before reset: call reset() first")
-        self._state, outcome = self._adapter.step(
+        self._state, outcome = self.adapter.step(
             self._state, {self._agent: np.asarray(action)[None]}
         )
         info = {name: value.item() for name, value in outcome.terms[self._agent].items()}
         info |= {n: v.item() for n, v in outcome.measures.items() if v.isfinite().all()}
         return (
-            in_one(self._adapter.observations(self._state)[self._agent]),
+            in_one(self.adapter.observations(self._state)[self._agent]),
             outcome.rewards[self._agent].item(),
             bool(outcome.terminated),
             bool(outcome.truncated),
@@ -186,11 +186,11 @@ class BatchedEnv(VectorEnv):
         if num_envs < 1:
             raise InputError(f"num_envs is {num_envs}, expected 1 or more")
         shown = (agent, images, image_pixels)
-        self._adapter, self._agent = _adapter(task, config, device, scene, arm, geometry, *shown)
+        self.adapter, self._agent = _adapter(task, config, device, scene, arm, geometry, *shown)
         self._state: TaskState | None = None
         self.num_envs = num_envs
-        self.single_observation_space = self._adapter.observation_space(self._agent)
-        self.single_action_space = Box(*self._adapter.action_bounds(self._agent))
+        self.single_observation_space = self.adapter.observation_space(self._agent)
+        self.single_action_space = Box(*self.adapter.action_bounds(self._agent))
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
@@ -200,11 +200,11 @@ class BatchedEnv(VectorEnv):
         Without a seed the random number streams of the last episodes continue.
         """
         if seed is None and self._state is not None:
-            self._state = self._adapter.restart(self._state)
+            self._state = self.adapter.restart(self._state)
         else:
             first = entropy_seed() if seed is None else seed
-            self._state = self._adapter.seeded(range(first, first + self.num_envs))
-        return self._adapter.observations(self._state)[self._agent], {}
+            self._state = self.adapter.seeded(range(first, first + self.num_envs))
+        return self.adapter.observations(self._state)[self._agent], {}
 
     def step(self, actions: np.ndarray):
         """Advance all environments: (observations, rewards, terminated, truncated, infos).
@@ -213,16 +213,16 @@ class BatchedEnv(VectorEnv):
         """
         if self._state is None:
             raise InputError("step before reset: call reset() first")
-        self._state, outcome = self._adapter.step(self._state, {self._agent: np.asarray(actions)})
+        self._state, outcome = self.adapter.step(self._state, {self._agent: np.asarray(actions)})
         done, info = outcome.done.cpu().numpy(), {}
         for name, value in {**outcome.terms[self._agent], **outcome.measures}.items():
             info[name], info[f"_{name}"] = value.cpu().numpy(), value.isfinite().cpu().numpy()
         if done.any():
-            last = self._adapter.observations(self._state)[self._agent]
+            last = self.adapter.observations(self._state)[self._agent]
             info["final_obs"], info["_final_obs"] = last, done
-            self._state = self._adapter.restart(self._state, outcome.done)
+            self._state = self.adapter.restart(self._state, outcome.done)
         return (
-            self._adapter.observations(self._state)[self._agent],
+            self.adapter.observations(self._state)[self._agent],
             outcome.rewards[self._agent].cpu().numpy(),
             outcome.terminated.cpu().numpy(),
             outcome.truncated.cpu().numpy(),

@@ -190,7 +190,7 @@ def test_what_is_lost_on_the_way_is_counted_and_does_not_stop_the_run(bench):
     bench.damage_every = 7
     with guarded(open_rig(bench.options + FAST)) as rig:
         drive(rig, [5.0, 5.0, 5.0], 10)
-        bench.skipped = set(range(bench._number + 10, bench._number + 80, 10))
+        bench.skipped = set(range(bench.number + 10, bench.number + 80, 10))
         bench.exchanged = (1, 3)
         samples = drive(rig, [5.0, 5.0, 5.0], 60)
         counts = rig.rig.counts

@@ -90,7 +90,7 @@ def test_the_geometry_asked_for_decides(geometry, monkeypatch):
     env.step({agent: np.full(3, 2.0, np.float32) for agent in env.agents})
     # The task's reset, what the adapter takes over from it, and the step.
     assert asked.count("clearance") == 3
-    arms, scene = env._state.world.arms, env._state.world.scene
+    arms, scene = env.task_state.world.arms, env.task_state.world.scene
     shapes = {name: ArmShape(part.line_mm[0].numpy(), 7.5) for name, part in arms.items()}
     exact = referee.clearance(shapes).least_mm
     near = {"fcl": 1e-4, "batched": 0.5}[geometry]
@@ -231,7 +231,7 @@ def test_gymnasium_takes_the_arm_and_refuses_what_it_does_not_know(tmp_path):
     plain = gymnasium.make("surgisoft/track_circle-v0")
     np.testing.assert_array_equal(env.reset(seed=4)[0], plain.reset(seed=4)[0])
     many = gymnasium.make_vec("surgisoft/keyhole-v0", num_envs=2, geometry="fcl")
-    assert isinstance(many.unwrapped._adapter.task.world.scene.collision, ExactScene)
+    assert isinstance(many.unwrapped.adapter.task.world.scene.collision, ExactScene)
     for make in (gymnasium.make, gymnasium.make_vec):
         with pytest.raises(InputError, match="no arm model there"):
             make("surgisoft/track_circle-v0", arm=tmp_path / "none")

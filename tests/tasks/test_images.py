@@ -77,7 +77,7 @@ def test_rows_of_all_interfaces_show_the_same(task):
             np.testing.assert_array_equal(one[name], seen[name][b].numpy())
         np.testing.assert_array_equal(stacked[name], seen[name].numpy())
     with torch.inference_mode():
-        many._state.world.steps[1] = task.steps - 1
+        many.state.world.steps[1] = task.steps - 1
     push = {agent: torch.full((2, 3), 3.0) for agent in many.agents}
     step = many.step(push)
     assert step.truncated.tolist() == [False, True]

@@ -25,7 +25,7 @@ def both(geometry, change=None):
     """The environment, and one that advances the task's batch of one."""
     env = parallel_env("circle_ablation", geometry=geometry)
     plain = SurgicalEnv(env.task)
-    plain._adapter.alone = lambda state: None
+    plain.adapter.alone = lambda state: None
     return env, plain
 
 
@@ -34,11 +34,11 @@ def differences(env, plain, seed, steps, at_work):
     rng, worst, fired = np.random.default_rng(seed), {}, 0
     for one in (env, plain):
         one.reset(seed=seed)
-    assert isinstance(env._lone, LoneRing)
+    assert isinstance(env.lone, LoneRing)
     with torch.inference_mode():
         for step in range(steps):
             if at_work(step):
-                acts = {a: t.numpy()[0] for a, t in env.task.script(plain._state).items()}
+                acts = {a: t.numpy()[0] for a, t in env.task.script(plain.task_state).items()}
             else:
                 acts = {a: rng.uniform(-1.0, 1.0, 3).astype("f4") for a in plain.agents}
             found, expected = env.step(acts), plain.step(acts)
@@ -56,7 +56,7 @@ def differences(env, plain, seed, steps, at_work):
             fired += found[4]["laser"]["cut"]
             if not plain.agents:
                 break
-        lone, batch = env._state, plain._state
+        lone, batch = env.task_state, plain.task_state
     for name, part in batch.world.arms.items():
         for field in ("points_mm", "line_mm", "pressure", "command"):
             off = (getattr(lone.world.arms[name], field) - getattr(part, field)).abs().max()
@@ -144,14 +144,14 @@ def test_what_has_noise_is_left_to_the_task(vary):
     config = CircleAblationConfig(world=WorldConfig(randomisation=Randomisation(**vary)))
     env = SurgicalEnv(CircleAblation(config))
     env.reset(seed=0)
-    assert env._lone is None
+    assert env.lone is None
 
 
 def test_gain_delay_and_lesion_of_the_episode_are_kept():
     vary = Randomisation(gain=0.05, delay=3, mount_mm=1.0, mount_rad=0.01, lesion_mm=3.0, lesions=3)
     task = CircleAblation(CircleAblationConfig(world=WorldConfig(randomisation=vary)))
     env, plain = SurgicalEnv(task), SurgicalEnv(task)
-    plain._adapter.alone = lambda state: None
+    plain.adapter.alone = lambda state: None
     worst, _ = differences(env, plain, 2, 40, lambda k: k < 20)
     assert_alike(worst)
 

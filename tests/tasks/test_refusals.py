@@ -119,7 +119,7 @@ def test_a_task_of_another_package_is_what_it_says(monkeypatch):
     other = dataclasses.replace(own, build=lambda config, device: named_b)
     loads = {"number": lambda: 5, "other": lambda: other, "broken": lambda: 1 / 0}
     offered = {name: Entry(name, load) for name, load in loads.items()}
-    monkeypatch.setattr(registry, "_offered", lambda path: offered)
+    monkeypatch.setattr(registry, "offered", lambda path: offered)
     assert "task 'number' (m:x): is a int, expected a surgisoft.tasks.spec.TaskSpec" in refusal(
         lambda: make_task("number")
     )

@@ -89,6 +89,7 @@ def run_tests(
                 os.setsid()
                 os.dup2(out.fileno(), 1)
                 os.dup2(out.fileno(), 2)
+                sys.stdout, sys.stderr = (os.fdopen(n, "w", closefd=False) for n in (1, 2))
                 _pytest(tree, arguments)
             finally:
                 os._exit(70)

@@ -6,6 +6,7 @@ the first to run.
 
 import importlib.util
 import os
+import resource
 import signal
 import sys
 import tempfile
@@ -16,8 +17,11 @@ from pathlib import Path
 
 from benchmarks.mutants import Mutant, mutated
 
-LONGEST_S = 900
-"""Time after which the tests of a mutant are ended: a hang is noticed, too, s."""
+LONGEST_S = 600
+"""Processor time of a process after which the tests of a mutant are ended: a hang is noticed, too,
+s."""
+MOST_WAITED_S = 7200
+"""Wall time after which they are ended, s. It shows nothing: the machine may be busy."""
 LIBRARIES = ("numpy", "scipy.optimize", "scipy.stats", "scipy.spatial", "pandas", "pyarrow.parquet")
 LIBRARIES += ("numba", "torch", "tensordict", "trimesh", "pytest", "hypothesis", "rerun")
 """What is imported once, before the first process is forked."""
@@ -54,19 +58,24 @@ def run(mutant: Mutant, tree: Path, first: str | None) -> dict:
     file, began = tree / mutant.file, time.monotonic()
     text = file.read_text()
     file.write_text(mutated(mutant, text))
+    outcome, failed = "survived", []
     try:
-        code, failed = 0, []
-        if first is not None:
-            code, failed = run_tests(tree, ["-x", first])
-        if code != 1:  # it did not notice, or is no more
-            code, failed = run_tests(tree, ["-x", *mutant.tests])
+        for test in (first, *mutant.tests):  # one by one: pytest would run a file in its own order
+            if test is None:
+                continue
+            code, failed = run_tests(tree, ["-x", test])
+            if code == 1:
+                outcome = "caught"
+                break
+            if code != 0 and test in mutant.tests:  # another `first` may be no more
+                outcome = "broken"
     finally:
         file.write_text(text)
     return {
         "name": mutant.name,
         "key": key_of(mutant),
-        "outcome": {0: "survived", 1: "caught"}.get(code, "broken"),
-        "by": failed[0] if failed else "",
+        "outcome": outcome,
+        "by": failed[0] if outcome == "caught" and failed else "",
         "seconds": round(time.monotonic() - began, 1),
     }
 
@@ -74,14 +83,15 @@ def run(mutant: Mutant, tree: Path, first: str | None) -> dict:
 def failing(outcomes: Iterable[dict], tree: Path) -> set[str]:
     """Those of the tests that noticed a mutant which also fail on the source as it is."""
     tests = sorted({outcome["by"] for outcome in outcomes if "::" in outcome["by"]})
-    failed = run_tests(tree, tests, LONGEST_S * 4)[1] if tests else []
-    return set(tests if failed == [NOT_ENDED] else failed)
+    code, failed = run_tests(tree, tests) if tests else (0, [])
+    return set(tests if code not in (0, 1) else failed)
 
 
-def run_tests(
-    tree: Path, arguments: Sequence[str], longest_s: float = LONGEST_S
-) -> tuple[int, list[str]]:
-    """pytest in a forked process: its exit code, or 1 after that time, and what failed."""
+def run_tests(tree: Path, arguments: Sequence[str]) -> tuple[int, list[str]]:
+    """pytest in a forked process: its exit code and what failed.
+
+    The code is 1 after `LONGEST_S` of processor time, -9 after `MOST_WAITED_S`.
+    """
     with tempfile.TemporaryFile() as out:
         pid = os.fork()
         if pid == 0:
@@ -90,21 +100,24 @@ def run_tests(
                 os.dup2(out.fileno(), 1)
                 os.dup2(out.fileno(), 2)
                 sys.stdout, sys.stderr = (os.fdopen(n, "w", closefd=False) for n in (1, 2))
+                resource.setrlimit(resource.RLIMIT_CPU, (LONGEST_S, LONGEST_S))
                 _pytest(tree, arguments)
             finally:
                 os._exit(70)
-        end = time.monotonic() + longest_s
+        end = time.monotonic() + MOST_WAITED_S
         while not (ended := os.waitpid(pid, os.WNOHANG))[0]:
             if time.monotonic() > end:
                 os.killpg(pid, signal.SIGKILL)
-                os.waitpid(pid, 0)
-                return 1, [NOT_ENDED]
+                ended = os.waitpid(pid, 0)
+                break
             time.sleep(0.05)
         out.seek(0)
         said = out.read().decode("utf-8", "replace")
+    code = os.waitstatus_to_exitcode(ended[1])
+    if -code in (signal.SIGXCPU, signal.SIGKILL) and time.monotonic() < end:
+        return 1, [NOT_ENDED]
     lines = [line.split(" - ")[0].partition(" ") for line in said.splitlines()]
-    failed = [rest for word, _, rest in lines if word in ("FAILED", "ERROR")]
-    return os.waitstatus_to_exitcode(ended[1]), failed
+    return code, [rest for word, _, rest in lines if word in ("FAILED", "ERROR")]
 
 
 def _pytest(tree: Path, arguments: Sequence[str]) -> None:

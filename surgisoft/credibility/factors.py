@@ -48,12 +48,15 @@ def factors(found: Assessment) -> tuple[Factor, ...]:
     robots = {each.robot for each in found.comparators} - {""}
     stated = f"{len(robots)} stated" if robots else "none stated"
     equal = [each.equivalent for each in found.inputs]
-    form = f"no diagnosis: {found.no_diagnosis}"
+    form = f"{NOT_ASSESSED}: {found.no_diagnosis}"
     if found.diagnosis is not None:
         form = found.diagnosis.verdict.sentence
     agreement = f"{NOT_ASSESSED}: no episode of the scenario to check with the exact checker"
     if found.agreement is not None:
         agreement = found.agreement.sentence
+    steps = _part("u_num", parts.numerical_mm)
+    if parts.numerical_mm is None:
+        steps = f"{NOT_ASSESSED}: {steps}"
     domain = f"{NOT_ASSESSED}: no states of the scenario are given"
     if found.applicability is not None:
         domain = found.applicability.sentence
@@ -64,7 +67,7 @@ def factors(found: Assessment) -> tuple[Factor, ...]:
     return (
         Factor(code, "software quality assurance", versions, "Software"),
         Factor(code, "numerical code verification", agreement, "Software"),
-        Factor(calculation, "discretization error", _part("u_num", parts.numerical_mm), UNCERTAIN),
+        Factor(calculation, "discretization error", steps, UNCERTAIN),
         Factor(calculation, "numerical solver error", NOT_ASSESSED, ""),
         Factor(
             calculation,

@@ -82,4 +82,5 @@ def test_a_limit_that_the_system_refuses_is_left_out(monkeypatch):
 
     monkeypatch.setattr(resource, "setrlimit", setrlimit)
     apart.limit(1000)
-    assert given == [resource.RLIMIT_CPU, resource.RLIMIT_CORE]
+    memory = [resource.RLIMIT_DATA] if apart.STATM.is_file() else []
+    assert given == [resource.RLIMIT_CPU, *memory, resource.RLIMIT_CORE]

@@ -174,14 +174,15 @@ def decision(
         list[str] | None,
         typer.Option(
             metavar="SOURCE=FOLDER...",
-            help="Further sources of cases: folders with recordings before and after a change.",
+            help="Sources of cases that are collected anew: folders with recordings before and "
+            "after a change. All others are those that are stored.",
         ),
     ] = None,
     judge: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME=FOLDER...",
-            help="Cases that no fit uses: the fit to all other cases is tested on them.",
+            help="The same, of cases that no fit uses: the fit to all others is tested on them.",
         ),
     ] = None,
     robots: Robots = "200,201,202,203,204,205",
@@ -189,40 +190,46 @@ def decision(
         str, typer.Option(help="Robots among them that also get an undertrained model.")
     ] = "200,201,203",
     count: Annotated[
-        int, typer.Option(min=0, help="Number of cases of the own rig; 0: those that are stored.")
-    ] = 300,
+        int, typer.Option(min=0, help="Number of cases of the own rig that are collected anew.")
+    ] = 0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the own rig's cases.")] = 1,
-    without_truth: Annotated[
+    each_robot: Annotated[
         bool,
-        typer.Option(
-            "--without-truth",
-            help="Every case of a known effect takes part once more, without that effect among the "
-            "candidates: as one of an unknown effect.",
-        ),
+        typer.Option("--each-robot", help="Leave each robot out as well: one more fit for each."),
     ] = False,
     processes: Processes = 2,
     work: Work = Path("runs/benchmark-decision"),
+    keep: Annotated[
+        bool,
+        typer.Option(
+            "--keep", help="Store what was collected in benchmarks/decision/evidence, with --asset."
+        ),
+    ] = False,
     asset: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Write the decision fitted to all cases to this file."),
     ] = None,
     output: Output = None,
 ) -> None:
-    """Fit the decision of `diagnose` to cases of several sources; test it on each, left out."""
+    """Fit the decision of `diagnose` to cases of several sources; test it on each, left out.
+
+    Without options it uses the stored evidence of all sources. --count, --cases and --judge collect
+    the evidence of a source anew.
+    """
     from benchmarks.decision import own_rig
-    from benchmarks.decision.study import run
+    from benchmarks.decision.study import Collected, run
     from benchmarks.decision.table import markdown
 
     check_folder(work)
     plan = own_rig.Plan(_numbers("--robots", robots), _numbers("--undertrained", undertrained))
     with _kept("decision", work) as report:
-        some, aside, values = run(
-            plan, count, seed, cases or [], work, processes, report, judge or [], without_truth
-        )
+        new = Collected(plan, count, seed, cases or [], judge or [])
+        some, aside, values = run(new, work, processes, report, keeps=keep)
     if asset:
         write_atomically(asset, json.dumps(values, indent=1) + "\n")
         print(f"wrote {asset}")
-    _show("Decision results", values["command"], markdown(some, values, aside), output)
+    table = markdown(some, values, aside, each_robot)
+    _show("Decision results", values["command"], table, output)
 
 
 @app.command("setup-faults")

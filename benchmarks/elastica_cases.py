@@ -1,7 +1,7 @@
 """Cases for a diagnosis on the PyElastica rig: robots with recordings before and after a change.
 
     python -m benchmarks.elastica_cases FOLDER [--robots 101,102,...] [--count 100] [--seed 1]
-        [--processes 1]
+        [--pairs 0] [--unknown 0] [--processes 1]
 
 FOLDER (such as runs/elastica, outside git) gets
 
@@ -14,11 +14,14 @@ FOLDER (such as runs/elastica, outside git) gets
 
 Everything follows from the seeds, and what exists already is kept: a second call continues. The
 cases come in rounds that hold every known effect, unknown ones, pairs and clean robots, so that any
-first part of them is balanced. Strengths are chosen so that the RMS change is about the one drawn.
-Nothing here knows a model or a diagnosis.
+first part of them is balanced. `--pairs` and `--unknown` add cases of two effects, any two of the
+list that recordings can tell apart, and of unknown effects of more kinds; they have plans of their
+own, so that the rounds stay what they are. Strengths are chosen so that the RMS change is about the
+one drawn. Nothing here knows a model or a diagnosis.
 """
 
 import argparse
+import itertools
 import json
 import os
 from collections.abc import Callable
@@ -28,6 +31,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.diagnosis.cases import PAIRS
+from surgisoft.errors import InputError
 from surgisoft.files import write_atomically
 from surgisoft.measurement.protocols import Protocol
 from surgisoft.measurement.protocols.continuous import schedule
@@ -54,11 +58,25 @@ KNOWN = {
 }
 """Hidden effect of the rig -> the name that a diagnosis should give."""
 UNKNOWN = ("breathing", "stick_slip", "leak", "knock")
-"""Hidden effects for which a diagnosis has no name."""
+"""Hidden effects of the rounds for which a diagnosis has no name."""
+MORE_UNKNOWN = (*UNKNOWN, "tear", "marker_slip")
+"""Those of `--unknown`."""
+ALIKE = (
+    {"line_lag", "rate_dependence"},
+    {"drift", "thermal_drift"},
+    {"drift", "misalignment"},
+    {"stiffening", "coupling"},
+)
+"""Pairs that `--pairs` leaves out: one recording does not show which of the two it is, or that
+there are two. Both are first-order lags, both have the same name, both turn the base, both take
+push away as pressure rises."""
 CLEAN_A_ROUND, PAIRS_A_ROUND = 4, 2
 """Cases without any change, and with two effects, in a round."""
 CHANGE_MM = (0.4, 3.0)
 """Range of the RMS change of the key points that is drawn, log-uniformly [mm]."""
+PAIR_CHANGE_MM = (0.8, 3.0)
+"""The same of each effect of `--pairs` [mm]: its least is several times the validated error of the
+arm models that are fitted to these robots, so that both effects can be seen."""
 ROBOTS = "101,102,103,104,105"
 """Seeds of the default robots."""
 ELEMENTS = 8
@@ -86,12 +104,16 @@ TRIED_S = 40.0
 """Duration of a try [s]."""
 
 
+TAKES = {"round": 1_000, "pair": 10_000, "unknown": 20_000}
+"""Number of the first trial of each plan: every case has noise of its own."""
+
+
 @dataclass(frozen=True)
 class Case:
     """One case."""
 
     number: int
-    """Position in the list."""
+    """Position in its plan."""
     robot: int
     """Seed of the robot."""
     names: tuple[str, ...]
@@ -100,6 +122,13 @@ class Case:
     """RMS change of the key points that each of them should make [mm]."""
     after: str
     """A name of AFTER."""
+    plan: str = "round"
+    """A name of TAKES."""
+
+    @property
+    def name(self) -> str:
+        """Name of its folder."""
+        return f"{self.number:03d}" if self.plan == "round" else f"{self.plan}-{self.number:03d}"
 
     @property
     def truth(self) -> list[str]:
@@ -121,6 +150,36 @@ def cases(robots: list[int], count: int, seed: int) -> list[Case]:
             after = str(rng.choice(list(AFTER)))
             found.append(Case(len(found), robot, plan[k], float(change), after))
         turn += 1
+    return found[:count]
+
+
+def pairs(robots: list[int], count: int, seed: int) -> list[Case]:
+    """So many cases of two effects: every two of the list in turn, but for those that are ALIKE."""
+    every = [two for two in itertools.combinations(KNOWN, 2) if set(two) not in ALIKE]
+    return _drawn("pair", every, PAIR_CHANGE_MM, robots, count, seed)
+
+
+def unknowns(robots: list[int], count: int, seed: int) -> list[Case]:
+    """So many cases of an unknown effect, every kind in turn."""
+    return _drawn("unknown", [(name,) for name in MORE_UNKNOWN], CHANGE_MM, robots, count, seed)
+
+
+def _drawn(
+    plan: str,
+    every: list[tuple[str, ...]],
+    range_mm: tuple[float, float],
+    robots: list[int],
+    count: int,
+    seed: int,
+) -> list[Case]:
+    """The first `count` cases of rounds of a plan, each round in a random order."""
+    rng = np.random.default_rng([seed, *plan.encode()])
+    found: list[Case] = []
+    while len(found) < count:
+        for place in rng.permutation(len(every)):
+            change = np.exp(rng.uniform(*np.log(range_mm)))
+            robot, after = robots[len(found) % len(robots)], str(rng.choice(list(AFTER)))
+            found.append(Case(len(found), robot, every[place], float(change), after, plan))
     return found[:count]
 
 
@@ -208,7 +267,7 @@ def strength_for(robot: int, name: str, wanted_mm: float, plain: np.ndarray) -> 
 
 def make_case(folder: Path, case: Case) -> None:
     """Record one case."""
-    place = folder / "cases" / f"{case.number:03d}"
+    place = folder / "cases" / case.name
     if (place / "truth.json").is_file():
         return
     robot = folder / "robots" / str(case.robot)
@@ -217,13 +276,19 @@ def make_case(folder: Path, case: Case) -> None:
         (name, strength_for(case.robot, name, case.change_mm, plain["tried"]))
         for name in case.names
     ]
-    rig = arm(case.robot, take=1000 + case.number, hidden=hidden)
+    rig = arm(case.robot, take=TAKES[case.plan] + case.number, hidden=hidden)
     recording, points = record(rig, after_protocol(rig, case.robot, case.after))
     (place / "after").mkdir(parents=True, exist_ok=True)
     save_recording(recording, place / "after" / f"{case.after}.parquet", force=True)
+    about_hidden: list[dict] = [{"effect": name, "strength": given} for name, given in hidden]
+    if case.plan == "pair":
+        for each, own in zip(about_hidden, hidden, strict=True):
+            alone = arm(case.robot, noise=0.0, hidden=[own])
+            moved = record(alone, after_protocol(alone, case.robot, case.after))[1]
+            each["change_rms_mm"] = change_mm(moved, plain[case.after])
     about = {
         "robot": str(case.robot),
-        "hidden": [{"effect": name, "strength": strength} for name, strength in hidden],
+        "hidden": about_hidden,
         "truth": case.truth,
         "change_rms_mm": change_mm(points, plain[case.after]),
         "noise_mm": recording.noise_mm,
@@ -233,37 +298,44 @@ def make_case(folder: Path, case: Case) -> None:
     _write(place / "truth.json", about)
 
 
+def made(folder: Path, case: Case) -> str:
+    """Record one case; says so where it is left out, because the arm is unstable with it."""
+    try:
+        make_case(folder, case)
+    except InputError as reason:
+        return f": {case.name} left out, {reason}"
+    return ""
+
+
 def run(
     folder: Path,
     robots: list[int],
-    count: int,
-    seed: int,
+    drawn: list[Case],
     processes: int,
     report: Callable[[str], None],
 ) -> None:
     """Make the robots that the cases need, each before its first case, and the cases in order."""
     folder.mkdir(parents=True, exist_ok=True)
-    drawn = cases(robots, count, seed)
+    count = len(drawn)
     if processes == 1:
-        for case in drawn:
+        for number, case in enumerate(drawn):
             make_robot(folder, case.robot)
-            make_case(folder, case)
-            report(f"{case.number + 1} of {count}")
+            report(f"{number + 1} of {count}{made(folder, case)}")
         return
     with workers(processes) as pool:
         for robot in pool.map(make_robot, [folder] * len(robots), robots):
             report(f"robots {robot or ''}")
-        for number, _ in enumerate(pool.map(make_case, [folder] * count, drawn)):
-            report(f"{number + 1} of {count}")
+        for number, text in enumerate(pool.map(made, [folder] * count, drawn)):
+            report(f"{number + 1} of {count}{text}")
 
 
 def _write(path: Path, about: dict) -> None:
     write_atomically(path, (json.dumps(about, indent=1) + "\n").encode())
 
 
-def load_case(folder: Path, number: int) -> tuple[dict, list[Recording], list[Recording]]:
+def load_case(folder: Path, name: str) -> tuple[dict, list[Recording], list[Recording]]:
     """A case's truth, and its recordings before and after."""
-    place = folder / "cases" / f"{number:03d}"
+    place = folder / "cases" / name
     truth = json.loads((place / "truth.json").read_text())
     before = folder / "robots" / truth["robot"] / "before"
     both = [
@@ -277,13 +349,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--robots", default=ROBOTS, help="seeds, with commas")
-    parser.add_argument("--count", type=int, default=100)
+    parser.add_argument("--count", type=int, default=100, help="cases of the rounds")
+    parser.add_argument("--pairs", type=int, default=0, help="further cases of two effects")
+    parser.add_argument("--unknown", type=int, default=0, help="further cases of unknown effects")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--processes", type=int, default=1)
     given = parser.parse_args()
     robots = [int(word) for word in given.robots.split(",")]
-    run(given.folder, robots, given.count, given.seed, given.processes,
-        lambda text: print(text, flush=True))  # fmt: skip
+    drawn = [
+        *cases(robots, given.count, given.seed),
+        *pairs(robots, given.pairs, given.seed),
+        *unknowns(robots, given.unknown, given.seed),
+    ]
+    run(given.folder, robots, drawn, given.processes, lambda text: print(text, flush=True))
 
 
 if __name__ == "__main__":

@@ -2,15 +2,18 @@
 
 A case is a model, recordings and what is known to be missing. Its evidence takes seconds of
 processor time and is stored as one line of JSON, so that the decision is fitted again without
-repeating a diagnosis.
+repeating a diagnosis. The folder `evidence` beside this module holds, in one file for each source,
+the cases that the decision in force was fitted to, and in `evidence/judged` those that it is judged
+on and was never fitted to.
 """
 
+import gzip
 import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from surgisoft.diagnosis.candidates import Candidate, candidates
 from surgisoft.diagnosis.evidence import VERSION, Evidence, evidence_of
@@ -19,11 +22,21 @@ from surgisoft.diagnosis.pairs import before_and_after
 from surgisoft.diagnosis.residuals import Problem, residual_table
 from surgisoft.diagnosis.selection import find
 from surgisoft.diagnosis.testability import testable
-from surgisoft.files import json_safe
+from surgisoft.files import json_safe, write_atomically
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.effects import known_effects
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.training_residuals import TrainingResiduals
+
+EVIDENCE = Path(__file__).parent / "evidence"
+"""Folder of the stored evidence of the decision in force."""
+JUDGED = "judged"
+"""Folder therein of cases that take no part in any fit."""
+ENDING = ".jsonl.gz"
+"""End of the name of a file of stored evidence."""
+DIGITS = 5
+"""Significant digits of a stored number. On 691 cases no probability of the decision in force
+changed by more than 0.00005 with five digits, 0.0006 with four and 0.004 with three."""
 
 Label = Literal["known", "unknown", "clean", "network", "other_robot", "setup"]
 """What is true of a case: effects of the list are missing; one outside the list is; nothing; the
@@ -71,8 +84,31 @@ class Labelled:
         return 9.0 if self.effect_mm is None else self.effect_mm / max(self.validated_mm, 1e-9)
 
     def to_json(self) -> dict:
-        """Plain values."""
-        return json_safe(asdict(self))
+        """Plain values, numbers with DIGITS significant digits."""
+        return _rounded(json_safe(asdict(self)))
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> "Labelled":
+        """The case that `to_json` wrote."""
+        plain = dict(values)
+        plain["truth"] = tuple(plain["truth"])
+        plain["left_out"] = tuple(plain.get("left_out", ()))
+        plain["evidence"] = Evidence.from_json(plain["evidence"])
+        return cls(**plain)
+
+    @property
+    def line(self) -> str:
+        """The case as a line of JSON, equal for equal cases."""
+        return json.dumps(self.to_json(), sort_keys=True)
+
+
+def _rounded(values: Any) -> Any:
+    """Plain values with numbers rounded to DIGITS significant digits."""
+    if isinstance(values, dict):
+        return {key: _rounded(value) for key, value in values.items()}
+    if isinstance(values, list):
+        return [_rounded(value) for value in values]
+    return float(f"{values:.{DIGITS}g}") if isinstance(values, float) else values
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,26 +179,40 @@ def without_truth(case: Labelled, posed: Posed) -> Labelled | None:
 
 def read(path: Path) -> list[Labelled]:
     """The stored cases of a file; an incomplete last line and other versions are left out."""
+    if not path.is_file():
+        return []
+    packed = path.name.endswith(".gz")
+    text = gzip.decompress(path.read_bytes()).decode() if packed else path.read_text()
     answer = {}
-    for line in path.read_text().splitlines() if path.is_file() else []:
+    for line in text.splitlines():
         try:
             values = json.loads(line)
         except json.JSONDecodeError:
             continue
         if values.get("version") != VERSION:
             continue
-        values["truth"] = tuple(values["truth"])
-        values["left_out"] = tuple(values.get("left_out", ()))
-        values["evidence"] = Evidence.from_json(values["evidence"])
-        answer[values["case"]] = Labelled(**values)
+        answer[values["case"]] = Labelled.from_json(values)
     return list(answer.values())
+
+
+def stored(folder: Path = EVIDENCE) -> dict[str, list[Labelled]]:
+    """The cases of each source of a folder of stored evidence."""
+    files = sorted(folder.glob(f"*{ENDING}"))
+    return {file.name.removesuffix(ENDING): read(file) for file in files}
+
+
+def keep(folder: Path, source: str, some: Sequence[Labelled]) -> None:
+    """Store all cases of a source in a folder; equal cases give equal bytes, in any order."""
+    folder.mkdir(parents=True, exist_ok=True)
+    text = "".join(f"{line}\n" for line in sorted(one.line for one in some))
+    write_atomically(folder / f"{source}{ENDING}", gzip.compress(text.encode(), 9, mtime=0))
 
 
 def append(path: Path, *some: Labelled) -> None:
     """Store cases at the end of a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a") as file:
-        file.write("".join(json.dumps(one.to_json()) + "\n" for one in some))
+        file.write("".join(f"{one.line}\n" for one in some))
 
 
 def twin_of(done: Mapping[str, Labelled], name: str) -> Labelled | None:

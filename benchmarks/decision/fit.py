@@ -12,7 +12,6 @@ that is judged enters any choice.
 import datetime
 import hashlib
 import itertools
-import json
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -394,7 +393,7 @@ def fit(cases: Sequence[Labelled], command: str = "") -> dict:
         "schema": SCHEMA,
         "date": datetime.date.today().isoformat(),
         "command": command,
-        "sources": {name: _about(name, cases) for name in sorted({c.source for c in cases})},
+        "sources": {name: about(name, cases) for name in sorted({c.source for c in cases})},
         "models": models,
         "calibration": {
             name: {"constant": round(one.constant, 6), "slope": round(one.slope, 6)}
@@ -406,11 +405,10 @@ def fit(cases: Sequence[Labelled], command: str = "") -> dict:
     return values | {"sha256": content_hash(values)}
 
 
-def _about(source: str, cases: Sequence[Labelled]) -> dict:
+def about(source: str, cases: Sequence[Labelled]) -> dict:
     """Number of cases and robots of a source, and the hash of its evidence."""
     own = [case for case in cases if case.source == source]
-    lines = sorted(json.dumps(case.to_json(), sort_keys=True) for case in own)
-    digest = hashlib.sha256("\n".join(lines).encode()).hexdigest()
+    digest = hashlib.sha256("\n".join(sorted(case.line for case in own)).encode()).hexdigest()
     return {"cases": len(own), "robots": len({c.robot for c in own}), "evidence_sha256": digest}
 
 

@@ -1,62 +1,91 @@
-"""Collect the evidence of all sources and fit the decision to it."""
+"""The evidence of all sources, collected or stored, and the decision that is fitted to it."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.decision import folders, own_rig
-from benchmarks.decision.evidence_log import Labelled, read
+from benchmarks.decision.evidence_log import EVIDENCE, JUDGED, Labelled, keep, read, stored
 from benchmarks.decision.fit import fit
 from surgisoft.errors import InputError
 from surgisoft.progress import Progress
 
 
+@dataclass(frozen=True)
+class Collected:
+    """What is collected anew; all other sources are those that are stored."""
+
+    own: own_rig.Plan
+    """Robots of the own rig."""
+    count: int = 0
+    """Cases of the own rig; 0: none is collected."""
+    seed: int = 1
+    """Seed of these cases."""
+    sources: Sequence[str] = ()
+    """`NAME=FOLDER` of the other sources."""
+    judged: Sequence[str] = ()
+    """The same, of cases that take no part in any fit."""
+
+    @property
+    def command(self) -> str:
+        """The command that collects them."""
+        words = ["surgisoft benchmark decision"]
+        if self.count:
+            robots, poor = (
+                ",".join(map(str, some)) for some in (self.own.robots, self.own.undertrained)
+            )
+            words.append(f"--robots {robots} --undertrained {poor}")
+            words.append(f"--count {self.count} --seed {self.seed}")
+        for option, given in (("--cases", self.sources), ("--judge", self.judged)):
+            words += [f"{option} {name}={folder.name}" for name, folder in map(_source, given)]
+        return " ".join(words)
+
+
 def run(
-    plan: own_rig.Plan,
-    count: int,
-    seed: int,
-    sources: list[str],
+    new: Collected,
     work: Path,
     processes: int,
     report: Progress,
-    judged: Sequence[str] = (),
-    twins: bool = False,
+    evidence: Path = EVIDENCE,
+    keeps: bool = False,
 ) -> tuple[list[Labelled], list[Labelled], dict]:
     """(all cases of the fit, those that are judged only, the values of the asset that is fitted).
 
-    sources: `NAME=FOLDER`; the evidence of each is stored in `work/evidence/NAME.jsonl`. judged:
-    the same, of cases that take no part in any fit. twins: whether every case of a known effect
-    also takes part without its truth among the candidates, as one of an unknown effect.
+    work: the evidence of a source that is collected is stored in `work/evidence/NAME.jsonl`, that
+    of the own rig with what was there before. evidence: folder of the stored evidence. keeps:
+    whether what was collected is stored there, too, in the place of its source.
     """
     logs = work / "evidence"
-    command = "surgisoft benchmark decision"
-    own = logs / f"{own_rig.SOURCE}.jsonl"
-    if count:
-        robots, poor = (",".join(map(str, some)) for some in (plan.robots, plan.undertrained))
-        command += f" --robots {robots} --undertrained {poor} --count {count} --seed {seed}"
-        some = own_rig.run(plan, count, seed, work / "models", own, processes, report, twins)
-    else:
-        some = [one for one in read(own) if twins or not one.left_out]
-    for given in sources:
-        name, folder = _source("--cases", given)
-        log = logs / f"{name}.jsonl"
-        some += folders.run(name, folder, work / "models", log, processes, report, True, twins)
-        command += f" --cases {name}={folder.name}"
-    if twins:
-        command += " --without-truth"
-    aside: list[Labelled] = []
-    for given in judged:
-        name, folder = _source("--judge", given)
-        log = logs / f"{name}.jsonl"
-        aside += folders.run(name, folder, work / "models", log, processes, report, off=False)
-        command += f" --judge {name}={folder.name}"
-    if not some:
-        raise InputError(f"{logs}: no stored cases; give --count or --cases")
-    return some, aside, fit(some, command)
+    every, aside = stored(evidence), stored(evidence / JUDGED)
+    if new.count:
+        own = logs / f"{own_rig.SOURCE}.jsonl"
+        own_rig.run(new.own, new.count, new.seed, work / "models", own, processes, report, True)
+        every[own_rig.SOURCE] = read(own)  # with those of other seeds
+    for target, given, fitted in ((every, new.sources, True), (aside, new.judged, False)):
+        for name, folder in map(_source, given):
+            log = logs / f"{name}.jsonl"
+            target[name] = folders.run(
+                name, folder, work / "models", log, processes, report, off=fitted, twins=fitted
+            )
+    if not every:
+        raise InputError(f"{evidence}: no stored evidence; give --count or --cases")
+    if keeps:
+        for target, folder in ((every, evidence), (aside, evidence / JUDGED)):
+            for name, some in target.items():
+                keep(folder, name, some)
+    fitted_to, judged = (_ordered(some) for some in (every, aside))
+    return fitted_to, judged, fit(fitted_to, new.command)
 
 
-def _source(option: str, given: str) -> tuple[str, Path]:
+def _ordered(sources: dict[str, list[Labelled]]) -> list[Labelled]:
+    """All cases as they are stored, in an order that does not depend on how they were collected."""
+    some = [Labelled.from_json(one.to_json()) for own in sources.values() for one in own]
+    return sorted(some, key=lambda one: (one.source, one.case))
+
+
+def _source(given: str) -> tuple[str, Path]:
     """(name, folder) of `NAME=FOLDER`."""
     name, _, folder = given.partition("=")
     if not folder or not Path(folder).is_dir():
-        raise InputError(f"{option} {given}: expected NAME=FOLDER with an existing folder")
+        raise InputError(f"{given}: expected NAME=FOLDER with an existing folder")
     return name, Path(folder)

@@ -292,6 +292,30 @@ def kinds(some: Sequence[Judged]) -> str:
     return "\n".join(lines)
 
 
+def serious(some: Sequence[Judged]) -> str:
+    """Every wrong name of at least the confidence SERIOUS, the surest first."""
+    wrong = [
+        one
+        for one in real(some)
+        if one.decision.kind in NAMING and one.decision.confidence >= SERIOUS and not one.right
+    ]
+    lines = ["| source | case | true | named | confidence | motions |", "|---|---|---|---|---|---|"]
+    for one in sorted(wrong, key=lambda one: -one.decision.confidence):
+        case, decision = one.case, one.decision
+        joined = " and " if decision.kind == "several" else " or "
+        lines.append(
+            f"| {case.source} | {case.case} | {' and '.join(case.truth) or label_of(case)} "
+            f"| {joined.join(decision.effects)} | {decision.confidence:.2f} "
+            f"| {case.evidence.motions} |"
+        )
+    return "\n".join(lines) if wrong else "None."
+
+
+def label_of(case: Labelled) -> str:
+    """What is true of a case, in words."""
+    return case.label.replace("_", " ")
+
+
 def neighbours(some: Sequence[Judged]) -> str:
     """What was said where the missing effect was no candidate, by that effect."""
     table: dict[str, list[Judged]] = {}
@@ -335,7 +359,7 @@ def sources(cases: Sequence[Labelled]) -> str:
     lines += ["|---|---|---|---|---|"]
     for source in sorted({case.source for case in cases}):
         own = [case for case in cases if case.source == source]
-        count = Counter(c.label.replace("_", " ") for c in own if not c.left_out)
+        count = Counter(label_of(c) for c in own if not c.left_out)
         text = ", ".join(f"{label} {number}" for label, number in count.most_common())
         robots, twins = len({case.robot for case in own}), sum(bool(c.left_out) for c in own)
         lines.append(f"| {source} | {robots} | {len(own) - twins} | {text} | {twins} |")
@@ -401,8 +425,17 @@ def chosen_costs(models: dict[str, DecisionModel]) -> str:
     return "\n".join(lines)
 
 
-def markdown(cases: Sequence[Labelled], values: dict, aside: Sequence[Labelled] = ()) -> str:
-    """The whole report. aside: cases that took no part in any fit."""
+def markdown(
+    cases: Sequence[Labelled],
+    values: dict,
+    aside: Sequence[Labelled] = (),
+    each_robot: bool = False,
+) -> str:
+    """The whole report.
+
+    aside: cases that took no part in any fit; each_robot: whether each robot is left out, too,
+    which takes one fit for each of them.
+    """
     models = fits_without(cases)
     by_source = left_out(cases, models)
     together = [one for some in by_source.values() for one in some]
@@ -412,6 +445,7 @@ def markdown(cases: Sequence[Labelled], values: dict, aside: Sequence[Labelled] 
         parts += ["## Each source left out of the fit", goals(columns)]
         parts += ["### What was said", kinds(together)]
         parts += ["### Reliability", reliability(together)]
+        parts += ["### Wrong names with a confidence of 0.8 or more", serious(together)]
         if any(case.left_out for case in cases):
             parts += ["### Known effects that were no candidates", neighbours(together)]
         parts += ["### Costs chosen", chosen_costs(models)]
@@ -426,9 +460,10 @@ def markdown(cases: Sequence[Labelled], values: dict, aside: Sequence[Labelled] 
         parts += ["## Unseen robots", goals(new)]
         for name, some in new.items():
             parts += [f"### What was said, {name}", kinds(some)]
-    inside = robots_left_out(cases)
-    parts += ["## Each robot left out of the fit", goals({"all sources": inside})]
-    parts += ["### What was said, robots left out", kinds(inside)]
+    if each_robot:
+        inside = robots_left_out(cases)
+        parts += ["## Each robot left out of the fit", goals({"all sources": inside})]
+        parts += ["### What was said, robots left out", kinds(inside)]
     parts += ["## The fitted weights", weights(values), curves(values)]
     return "\n\n".join(parts) + "\n"
 

@@ -6,9 +6,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.decision.evidence_log import Labelled, append, posed_on, read, without_truth
+from benchmarks.decision.evidence_log import (
+    EVIDENCE,
+    JUDGED,
+    Labelled,
+    append,
+    keep,
+    posed_on,
+    read,
+    stored,
+    without_truth,
+)
 from benchmarks.decision.fit import (
     PRIORS,
+    about,
     case_weights,
     costs_of,
     curve_of,
@@ -19,6 +30,7 @@ from benchmarks.decision.fit import (
     sample,
 )
 from benchmarks.decision.own_rig import ROUND, Plan, draw
+from benchmarks.decision.study import Collected, run
 from benchmarks.decision.table import (
     BINS,
     Judged,
@@ -28,8 +40,10 @@ from benchmarks.decision.table import (
     markdown,
     neighbours,
     rate,
+    serious,
 )
 from surgisoft.diagnosis.decision import (
+    ASSET,
     FEATURES,
     Curve,
     Decision,
@@ -39,6 +53,7 @@ from surgisoft.diagnosis.decision import (
     features_of,
 )
 from surgisoft.diagnosis.diagnose import diagnose
+from surgisoft.errors import InputError
 from tests.diagnosis.synthetic import recording, still_model, walk
 from tests.diagnosis.test_decision import ALONE, CREEP, GOOD, LAG
 
@@ -299,6 +314,21 @@ def test_the_table_counts_by_hand():
     assert "25 % (1 of 4" in lines["a wrong name with confidence >= 0.8, of all cases"]
 
 
+def test_wrong_names_with_confidence_are_listed_one_by_one():
+    some = [
+        said("identified", ("creep",), 0.97),
+        said("identified", ("drift",), 0.79),
+        said("several", ("drift", "creep"), 0.81),
+        said("ambiguous", ("drift", "twist"), 0.9, label="clean", truth=()),
+    ]
+    lines = serious(some).splitlines()[2:]
+    assert [line.split("|")[3:6] for line in lines] == [
+        [" clean ", " drift or twist ", " 0.90 "],
+        [" creep ", " drift and creep ", " 0.81 "],
+    ]
+    assert serious(some[:2]) == "None."
+
+
 def test_a_log_survives_a_broken_line_and_another_version(tmp_path):
     log = tmp_path / "a.jsonl"
     append(log, case(1))
@@ -306,6 +336,68 @@ def test_a_log_survives_a_broken_line_and_another_version(tmp_path):
     with log.open("a") as file:
         file.write('{"source": "a", "rob')
     assert read(log) == [case(1)]
+
+
+def in_order(sources):
+    """All cases of stored sources in the order in which a fit reads them."""
+    some = [one for own in sources.values() for one in own]
+    return sorted(some, key=lambda one: (one.source, one.case))
+
+
+def test_the_asset_was_fitted_to_the_stored_evidence():
+    """Sources, numbers of cases and hashes are those that the asset in force states."""
+    values = json.loads(ASSET.read_text())
+    cases = in_order(stored())
+    assert {name: about(name, cases) for name in stored()} == values["sources"]
+
+
+@pytest.mark.parametrize("name", list(FEATURES))
+def test_the_stored_evidence_gives_the_weights_of_the_asset(name):
+    """At the penalties that the asset states. (L-BFGS ends within 0.01 of the least loss' weights
+    on any processor.)"""
+    one = json.loads(ASSET.read_text())["models"][name]
+    model = fit_one(name, sample(name, in_order(stored())), one["penalty"], one["twin_weight"])
+    assert model.constant == pytest.approx(one["constant"], abs=0.01)
+    assert model.weights == pytest.approx(list(one["weights"].values()), abs=0.01)
+
+
+def test_robots_that_judge_took_no_part_in_the_fit():
+    """No recording of a judged case is one of a case of the fit, nor of its robot."""
+    fitted = {(one.source, one.robot) for some in stored().values() for one in some}
+    assert fitted
+    for name, some in stored(EVIDENCE / JUDGED).items():
+        kin = next(source for source in stored() if name.startswith(source))
+        assert not fitted & {(kin, one.robot) for one in some}
+
+
+def test_stored_evidence_is_read_back_and_does_not_depend_on_the_order(tmp_path):
+    some = [replace(one, effect_mm=1.0 / 3.0) for one in some_cases("a", 5)]
+    keep(tmp_path, "a", some)
+    first = (tmp_path / "a.jsonl.gz").read_bytes()
+    keep(tmp_path, "a", some[::-1])
+    assert (tmp_path / "a.jsonl.gz").read_bytes() == first
+    (back,) = stored(tmp_path).values()
+    assert [one.case for one in back] == [one.case for one in some]
+    assert back[0].effect_mm == 0.33333
+    assert about("a", back) == about("a", some)
+    assert [Labelled.from_json(one.to_json()) for one in back] == back
+
+
+def test_without_options_the_fit_is_to_the_stored_evidence(tmp_path):
+    keep(tmp_path, "a", some_cases("a"))
+    keep(tmp_path, "b", some_cases("b", 30, seed=1))
+    keep(tmp_path / JUDGED, "a_b", some_cases("a_b", 10, seed=2))
+    new = Collected(Plan([1], []))
+    cases, aside, values = run(new, tmp_path / "work", 1, lambda *_: None, tmp_path)
+    assert (len(cases), len(aside)) == (70, 10)
+    assert {name: one["cases"] for name, one in values["sources"].items()} == {"a": 40, "b": 30}
+    assert values["command"] == "surgisoft benchmark decision"
+    assert not (tmp_path / "work").exists()
+
+
+def test_without_any_evidence_the_message_says_what_to_do(tmp_path):
+    with pytest.raises(InputError, match="no stored evidence; give --count or --cases"):
+        run(Collected(Plan([1], [])), tmp_path / "work", 1, lambda *_: None, tmp_path)
 
 
 def test_the_asset_names_its_cases():
@@ -317,7 +409,9 @@ def test_the_asset_names_its_cases():
     assert other["sources"]["a"]["evidence_sha256"] != values["sources"]["a"]["evidence_sha256"]
     assert other["sources"]["b"] == values["sources"]["b"]
     assert model_of(json.loads(json.dumps(values))).models["missing"].weights
-    assert "| a | 4 | 40 |" in markdown(cases, values)
+    table = markdown(cases, values, each_robot=True)
+    assert "| a | 4 | 40 |" in table
+    assert "## Each robot left out of the fit" in table
 
 
 def test_rounds_of_cases_have_the_shares_that_are_stated():

@@ -8,7 +8,19 @@ import pytest
 pytest.importorskip("elastica", reason="PyElastica is not installed (extra `elastica`)")
 
 from benchmarks import elastica_cases
-from benchmarks.elastica_cases import KNOWN, UNKNOWN, Case, cases, load_case, make_case, make_robot
+from benchmarks.elastica_cases import (
+    ALIKE,
+    KNOWN,
+    MORE_UNKNOWN,
+    UNKNOWN,
+    Case,
+    cases,
+    load_case,
+    make_case,
+    make_robot,
+    pairs,
+    unknowns,
+)
 from surgisoft.measurement.recordings import load_recording
 
 
@@ -29,6 +41,25 @@ def test_the_plan_follows_from_its_seed_and_only_grows():
     assert longer[:25] != cases([1, 2, 3], 25, seed=5)
 
 
+def test_pairs_are_every_two_that_are_not_alike_and_have_a_plan_of_their_own():
+    """15 effects make 105 pairs, four of which are alike. Every robot has its turn, and the plan
+    with more cases begins with the same ones."""
+    planned = pairs([1, 2, 3], 101, seed=4)
+    assert len({frozenset(case.names) for case in planned}) == 15 * 14 // 2 - len(ALIKE)
+    assert not [case for case in planned if set(case.names) in ALIKE]
+    assert all(len(set(case.truth)) == 2 for case in planned)
+    assert [case.robot for case in planned[:4]] == [1, 2, 3, 1]
+    assert planned[:20] == pairs([1, 2, 3], 20, seed=4)
+    assert len({case.name for case in [*planned, *cases([1], 101, seed=4)]}) == 202
+
+
+def test_unknown_effects_of_every_kind_come_in_turn():
+    planned = unknowns([1, 2], 2 * len(MORE_UNKNOWN), seed=4)
+    for part in (planned[: len(MORE_UNKNOWN)], planned[len(MORE_UNKNOWN) :]):
+        assert {case.names[0] for case in part} == set(MORE_UNKNOWN) > set(UNKNOWN)
+    assert all(case.truth == ["unknown"] for case in planned)
+
+
 @pytest.fixture
 def brief(monkeypatch):
     """Recordings of a few seconds."""
@@ -41,7 +72,7 @@ def test_a_case_repeats_the_actuation_and_differs_by_its_effect(tmp_path, brief)
     make_robot(tmp_path, 2)
     make_case(tmp_path, Case(0, 2, ("payload",), 1.0, "same"))
     make_case(tmp_path, Case(1, 2, (), 1.0, "same"))
-    truth, before, after = load_case(tmp_path, 0)
+    truth, before, after = load_case(tmp_path, "000")
     assert truth["truth"] == ["payload"]
     assert truth["same_actuation"]
     assert [recording.name for recording in before] == ["mixed", "other"]
@@ -50,8 +81,22 @@ def test_a_case_repeats_the_actuation_and_differs_by_its_effect(tmp_path, brief)
     found = np.sqrt(np.nanmean(change**2))  # with noise of 0.04 mm in each of six coordinates
     assert found == pytest.approx(truth["change_rms_mm"], abs=0.08)
     assert 0.4 < truth["change_rms_mm"] < 2.5
-    clean, _, _ = load_case(tmp_path, 1)
+    clean, _, _ = load_case(tmp_path, "001")
     assert (clean["truth"], clean["change_rms_mm"]) == ([], 0.0)
+
+
+def test_a_pair_states_what_each_effect_changes(tmp_path, brief):
+    """Each alone, on the actuation of the recording; so the two obey the triangle inequality."""
+    make_robot(tmp_path, 2)
+    make_case(tmp_path, Case(3, 2, ("payload", "misalignment"), 1.0, "mixed", "pair"))
+    make_case(tmp_path, Case(4, 2, ("payload",), 1.0, "mixed"))
+    truth, _, _ = load_case(tmp_path, "pair-003")
+    single, _, _ = load_case(tmp_path, "004")
+    each = {one["effect"]: one["change_rms_mm"] for one in truth["hidden"]}
+    assert truth["truth"] == ["payload", "misalignment"]
+    assert each["payload"] == pytest.approx(single["change_rms_mm"])
+    one, other = each.values()  # of small changes the two add, in whatever directions
+    assert abs(one - other) - 0.05 < truth["change_rms_mm"] < one + other + 0.05
 
 
 def test_what_exists_is_kept(tmp_path, brief):

@@ -341,7 +341,11 @@ def test_equal_seeds_give_equal_recordings_and_other_takes_other_noise():
     np.testing.assert_array_equal(truth.noise_free_mm, made[0][1].noise_free_mm)
 
 
-@pytest.mark.parametrize("name", [name for name in HIDDEN if name not in ("knock", "contact")])
+SUDDEN = {"knock", "tear", "marker_slip"}
+"""Effects that set in at one moment, after these brief recordings."""
+
+
+@pytest.mark.parametrize("name", [name for name in HIDDEN if name not in SUDDEN | {"contact"}])
 def test_each_hidden_effect_moves_the_key_points(name):
     """By more than a hundredth of a millimetre within seconds, and not by more than 2 cm."""
     plain = ElasticaRig(2, elements=8, noise=0.0)
@@ -382,6 +386,35 @@ def test_a_knock_turns_the_base_at_its_moment():
     times = rig.period_s * np.arange(1, 31)
     assert change[times < 0.95].max() < 1e-6
     assert change[-1] == pytest.approx(2.0, rel=0.5)
+
+
+def moved_by(name, strength=1.0, moment=31.0, samples=30):
+    """(T,) times [s], and (T, n) how far an effect moves the key points under pressure [mm]."""
+    moved = []
+    for hidden in ((), [(name, strength)]):
+        rig = ElasticaRig(2, elements=8, noise=0.0, hidden=hidden, event_window_s=(moment, moment))
+        rig.reset()
+        rig.command(rig.limits[:, 1] * np.eye(rig.chambers)[0])
+        moved.append([rig.read_beside_truth()[1].noise_free_mm[0] for _ in range(samples)])
+    times = rig.period_s * np.arange(1, samples + 1)
+    return times, np.linalg.norm(np.subtract(*moved), axis=2)
+
+
+def test_a_tear_bends_the_arm_more_from_its_moment_on():
+    """Before the moment nothing; after it the points above the tear move, the tip most."""
+    times, change = moved_by("tear", strength=4.0)
+    assert change[times < 0.95].max() < 1e-6
+    assert change[-1, -1] > 0.1
+    assert change[-1, -1] == change[-1].max()
+
+
+def test_markers_of_one_plane_slip_at_their_moment():
+    """By 3 mm at strength 1, along the arm; the body and all other planes stay where they are."""
+    times, change = moved_by("marker_slip")
+    assert change[times < 0.95].max() < 1e-6
+    slipped = change[-1] > 1e-6
+    assert slipped.sum() == 1
+    assert change[-1][slipped] == pytest.approx(3.0)
 
 
 def test_the_command_writes_a_recording(tmp_path, capsys):

@@ -199,6 +199,22 @@ def _leak(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     _set_gas(setup, leak=leak)
 
 
+def _tear(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    """The wall tears across the arm in its lower half, so that it bends more there."""
+    node = int(rng.integers(1, max(2, len(setup.plant.bend) // 2)))
+    share = 1.0 - math.exp(-0.25 * strength)
+    moment = rng.uniform(*setup.event_window_s)
+    _set(setup, tear=np.array([share, float(node), moment]))
+
+
+def _marker_slip(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    """The ring of markers of one key plane slides towards the base or the tip."""
+    plane = int(rng.integers(len(setup.plant.nodes)))
+    way = 3.0 * strength * rng.choice([-1.0, 1.0])
+    moment = rng.uniform(*setup.event_window_s)
+    _set(setup, slip=np.array([way, float(plane), moment]))
+
+
 HIDDEN: dict[str, Hidden[Setup]] = {
     "hysteresis": Hidden("material", "more elastoplastic friction in the wall", _hysteresis),
     "rate_dependence": Hidden("material", "an Eyring fluid in the wall", _rate_dependence),
@@ -220,6 +236,8 @@ HIDDEN: dict[str, Hidden[Setup]] = {
     "stick_slip": Hidden("body", "a bracket with dry friction that yields in jerks", _stick_slip),
     "leak": Hidden("line", "a crack in one chamber that opens at high pressure", _leak),
     "knock": Hidden("body", "the bracket is knocked aside at one moment", _knock),
+    "tear": Hidden("material", "the wall tears at one place, at one moment", _tear),
+    "marker_slip": Hidden("sensor", "a ring of markers slides at one moment", _marker_slip),
 }
 
 

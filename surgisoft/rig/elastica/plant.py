@@ -90,6 +90,12 @@ class Plant(NamedTuple):
     """(5,) largest shift of the base [m], period and delay of a breath [s]."""
     bracket: np.ndarray
     """(2,) compliance of the base [rad/(N m)] and the couple that its dry friction holds [N m]."""
+    tear: np.ndarray
+    """(3,) share of bending stiffness that the wall loses at one inner node [-], the number of that
+    node, and the moment [s]; share 0: none."""
+    slip: np.ndarray
+    """(3,) way that the markers of one key plane slide along the arm [mm], the number of that
+    plane, and the moment [s]; way 0: none."""
     warmth: float
     """Logarithm of modulus lost per kelvin [1/K]; nonzero: the room is not air-conditioned."""
     misalignment: np.ndarray
@@ -198,7 +204,7 @@ def place_base(plant: Plant, time: float, slipped: np.ndarray, clamp: np.ndarray
     """
     turn = np.zeros(3)
     slow = math.log(1.0 + max(time, 0.0) / 40.0) / math.log(1.0 + 600.0 / 40.0)
-    knocked = min(max((time - plant.knock[3]) / 0.2, 0.0), 1.0)
+    knocked = after(time, plant.knock[3])
     for d in range(3):
         turn[d] = plant.drift[d] * slow + plant.knock[d] * knocked
     turn[0] += slipped[0]
@@ -212,6 +218,12 @@ def place_base(plant: Plant, time: float, slipped: np.ndarray, clamp: np.ndarray
         clamp[d] = share * plant.breath[d]
     for i in range(3):
         rotate(turn, plant.base[i], axes[i])
+
+
+@compiled
+def after(time: float, moment: float) -> float:
+    """Share of a sudden event that has happened at a time [s]: it takes a fifth of a second."""
+    return min(max((time - moment) / 0.2, 0.0), 1.0)
 
 
 @compiled
@@ -282,6 +294,12 @@ def load_wall(plant: Plant, state: State, loaded: np.ndarray, added: np.ndarray)
     lost = -math.expm1(-plant.warmth * warm)
     strain_wall(plant.wall, lost, plant.step, bending, state.bending, loaded)
     strain_wall(plant.wall, lost, plant.step, stretch, state.stretch, added)
+    if plant.tear[0] > 0.0:
+        # A crack across the wall: there it carries less of its couple from one moment on.
+        torn = int(plant.tear[1])
+        for d in range(2):
+            share = plant.tear[0] * after(state.time[0], plant.tear[2])
+            loaded[d, torn] -= share * bending[d, torn]
     for k in range(elements):
         body.rest_sigma[2, k] = -axial_scale * added[0, k]
     for k in range(places):
@@ -368,6 +386,11 @@ def see(plant: Plant, state: State, tape: np.ndarray, seen: np.ndarray, clean: n
     """
     tracking = state.tracking
     sections(state.body, plant.nodes, state.centres, state.frames)
+    if plant.slip[0] != 0.0:
+        moved_on = plant.slip[0] * after(state.time[0], plant.slip[2])
+        loose = int(plant.slip[1])
+        for d in range(3):
+            state.centres[loose, d] += moved_on * state.frames[loose, d, 2]
     mark(plant.cameras, tracking, state.centres, state.frames, 1e-3 * state.air.chamber)
     moved = np.empty(3)
     for p in range(tracking.clean.shape[0]):

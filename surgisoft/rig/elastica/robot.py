@@ -120,6 +120,8 @@ def make_robot(
         knock=np.zeros(4),
         breath=np.zeros(5),
         bracket=np.zeros(2),
+        tear=np.zeros(3),
+        slip=np.zeros(3),
         warmth=0.0,
         misalignment=np.zeros(6),
         nodes=nodes,

@@ -88,6 +88,7 @@ FLOORS = {
         ("uncertainty", "retest", "domain"),
         ("scenario",),
         ("assessment",),
+        ("factors",),
         ("of_experiment", "page"),
     ),
     "scene": (

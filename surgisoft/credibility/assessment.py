@@ -12,7 +12,6 @@ import numpy as np
 from surgisoft import __version__
 from surgisoft.credibility.context import Context
 from surgisoft.credibility.domain import Applicability, applicability, states_of
-from surgisoft.credibility.factors import factors
 from surgisoft.credibility.metrics import Criterion, area_in_space
 from surgisoft.credibility.retest import Retest, retest
 from surgisoft.credibility.scenario import (
@@ -209,9 +208,6 @@ class Assessment:
                 "context_of_use": context.use,
                 "model_risk": asdict(context.risk) | {"level": context.risk.level},
                 "model": self.model,
-                "credibility_factors": [
-                    asdict(each) | {"assessed": each.assessed} for each in factors(self)
-                ],
                 "comparators": [asdict(each) for each in self.comparators],
                 "inputs": [asdict(each) for each in self.inputs],
                 "key_points": [

@@ -4,13 +4,9 @@ The standard asks for a goal of each factor that fits the model risk. The goals 
 report states the evidence, or that it has none.
 """
 
-from __future__ import annotations
+from dataclasses import asdict, dataclass
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from surgisoft.credibility.assessment import Assessment
+from surgisoft.credibility.assessment import Assessment
 
 NOT_ASSESSED = "not assessed"
 """Begin of what is said of a factor for which a report has no evidence."""
@@ -37,6 +33,10 @@ class Factor:
     def assessed(self) -> bool:
         """Whether the report has evidence."""
         return not self.evidence.startswith(NOT_ASSESSED)
+
+    def to_json(self) -> dict:
+        """Plain values."""
+        return asdict(self) | {"assessed": self.assessed}
 
 
 def factors(found: Assessment) -> tuple[Factor, ...]:

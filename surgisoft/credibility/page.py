@@ -46,7 +46,8 @@ def write_report(found: Assessment, folder: Path) -> list[Path]:
     """Write `credibility.html` and `credibility.json` into a folder; returns their paths."""
     page = write_page(credibility_page(found), folder / f"{NAME}.html")
     data = folder / f"{NAME}.json"
-    write_json(data, found.to_json())
+    stated = {"credibility_factors": [each.to_json() for each in factors(found)]}
+    write_json(data, found.to_json() | stated)
     return [page, data]
 
 

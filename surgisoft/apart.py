@@ -123,6 +123,8 @@ def limit(size: int) -> None:
 def answer(module: str, path: Path) -> int:
     """Read the file in this process and write what was found; the exit status."""
     reader = importlib.import_module(module)
+    for library in getattr(reader, "LIBRARIES", ()):
+        importlib.import_module(library)
     limit(path.stat().st_size)
     try:
         found = reader.as_bytes(path)

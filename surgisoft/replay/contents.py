@@ -12,6 +12,9 @@ from surgisoft.apart import read_apart
 
 TIME = "time"
 """Timeline of every replay, s since the start."""
+LIBRARIES = ("pyarrow.compute", "rerun.chunk")
+"""Modules that `surgisoft.apart` imports before it limits the memory: rerun-sdk 0.41 reserves 1 GiB
+and starts its threads when it is imported."""
 
 
 @dataclass(frozen=True)

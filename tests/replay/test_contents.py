@@ -1,5 +1,6 @@
 """Reading of a Rerun recording in a process of its own: a damaged file ends that one only."""
 
+import numpy as np
 import pytest
 import rerun as rr
 
@@ -11,8 +12,6 @@ from surgisoft.replay.recording import Columns, new_recording
 
 @pytest.fixture(scope="module")
 def replay(tmp_path_factory):
-    import numpy as np
-
     path = tmp_path_factory.mktemp("replay") / "a.rrd"
     layout = rr.blueprint.Blueprint(rr.blueprint.Spatial3DView(name="the scene"))
     with new_recording(path, "surgisoft_test", "one", layout) as recording:
@@ -38,3 +37,16 @@ def test_a_damaged_one_is_one_line(replay, tmp_path, capsys, damage):
         contents(copy)
     assert run(["replay", str(copy), "--web"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_the_library_itself_takes_nothing_of_the_memory_of_a_file(tmp_path):
+    """Of 1.6 MB: so large that the 1 GiB that Rerun reserves would fit, but not its threads."""
+    path = tmp_path / "a.rrd"
+    noise = np.random.default_rng(0).integers(0, 256, 1_600_000, np.uint8)
+    with rr.RecordingStream("test") as recording:
+        recording.save(path)
+        recording.set_time("time", duration=1.5)
+        recording.log("noise", rr.Tensor(noise))
+    recording.disconnect()
+    assert 1.5e6 < path.stat().st_size < 1.7e6
+    assert contents(path).duration_s == 1.5

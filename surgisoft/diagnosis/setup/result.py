@@ -36,6 +36,12 @@ LEAST_MOTION = 0.05
 most."""
 WHOLE = 0.95
 """A key point is dead, not frozen for a while, from this share of the rows on."""
+FORMER_KEYS = {
+    "mending": "instructions",
+    "alternative_mendings": "alternative_instructions",
+    "mendable": "correctable",
+}
+"""Keys in JSON until 2026-11-23, each with its present name; programs may still read them."""
 MOST_APART = 8
 """Most recordings that are tested one by one where they share no fault."""
 
@@ -82,8 +88,12 @@ class SetupResult:
         ]
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values, for `diagnose --json`."""
-        return {
+        """Plain values, for `diagnose --json`.
+
+        `mending`, `alternative_mendings` and `mendable` are deprecated names of `instructions`,
+        `alternative_instructions` and `correctable`.
+        """
+        plain = {
             "faults": [asdict(fault) for fault in self.faults],
             "alternatives": [[asdict(fault) for fault in some] for some in self.alternatives],
             "sentence": self.sentence,
@@ -96,6 +106,7 @@ class SetupResult:
             "recordings": list(self.recordings),
             "correctable": self.correctable,
         }
+        return plain | {old: plain[new] for old, new in FORMER_KEYS.items()}
 
 
 def find_setup_faults(model: ArmModel, recordings: Sequence[Recording]) -> SetupResult | None:

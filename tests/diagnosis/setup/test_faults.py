@@ -181,5 +181,9 @@ def test_a_diagnosis_ends_with_the_set_up(model):
     assert found.verdict.kind == "setup"
     assert found.verdict.effects == ()
     assert found.error_mm.before > 10 * found.error_mm.ceiling
-    assert found.to_json()["setup"]["faults"][0]["kind"] == "frame"
+    plain = found.to_json()["setup"]
+    assert plain["faults"][0]["kind"] == "frame"
+    assert plain["correctable"] is plain["mendable"] is True
+    assert plain["mending"] == plain["instructions"] == found.setup.instructions != ""
+    assert plain["alternative_mendings"] == plain["alternative_instructions"] == []
     assert "114.6 deg about z" in found.verdict.sentence  # 2 rad

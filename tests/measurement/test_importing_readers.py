@@ -323,10 +323,21 @@ def test_packed_numbers_take_no_gigabytes(tmp_path, monkeypatch, ending):
             file.create_dataset("t", data=zeros, compression="gzip")
     assert path.stat().st_size < 10_000
     monkeypatch.setattr(arrays, "MOST_UNPACKED", 1 << 20)
-    with pytest.raises(InputError, match=r"raw\..* holds 1600000 bytes of numbers, packed in"):
+    with pytest.raises(InputError, match=r"raw\..* (holds|claims) 1600000 bytes"):
         arrays.as_bytes(path)
     monkeypatch.setattr(arrays, "MOST_UNPACKED", 1 << 21)
     assert arrays.as_bytes(path)
+
+
+def test_a_matlab_file_that_memory_does_not_hold_is_not_called_damaged(tmp_path, monkeypatch):
+    def loadmat(*_, **__):
+        raise MemoryError
+
+    path = tmp_path / "raw.mat"
+    savemat(path, {"t": np.arange(3.0)})
+    monkeypatch.setattr("scipy.io.loadmat", loadmat)
+    with pytest.raises(InputError, match=r"raw\.mat: unpacks to more memory than .*compress"):
+        arrays.as_bytes(path)
 
 
 def test_an_hdf5_file_cannot_claim_gigabytes_or_other_files(tmp_path):

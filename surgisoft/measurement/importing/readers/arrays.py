@@ -90,6 +90,11 @@ def _matlab(path: Path) -> Iterator[tuple[str, np.ndarray]]:
 
     try:
         content = loadmat(path, simplify_cells=True, mat_dtype=True)
+    except MemoryError:
+        raise InputError(
+            f"{path}: unpacks to more memory than is allowed for a file of {path.stat().st_size} "
+            "bytes; expected a file with measurements, which do not compress as much"
+        ) from None
     except Exception as error:  # SciPy raises what its parser meets
         raise InputError(
             f"{path}: cannot be read as a MATLAB file ({type(error).__name__}: {error})"
@@ -111,10 +116,11 @@ def _hdf5(path: Path) -> Iterator[tuple[str, np.ndarray]]:
             return
         if item.external or item.is_virtual:  # the numbers are in other files
             return
-        left -= item.nbytes
+        held = max(item.nbytes, 8 * item.size)  # as they are packed, and as 64-bit numbers
+        left -= held
         if left < 0:
             raise InputError(
-                f"{path}: '{name}' claims {item.nbytes} bytes, in a file of "
+                f"{path}: '{name}' claims {held} bytes, in a file of "
                 f"{path.stat().st_size}; expected an HDF5 file with measurements"
             )
         found.extend(_inside(item[()], name.replace("/", ".")))

@@ -155,6 +155,19 @@ def test_a_run_takes_no_part_in_its_own_left_out_prediction():
     assert as_others < 0.2 * off
 
 
+def test_rows_held_out_share_no_fold_with_others():
+    """One of two runs is held out: a single fold would leave no rows to predict them from."""
+    train = lagged(range(5), 60)
+    points = train.key_points.clone()
+    points[2:] = torch.nan
+    held = torch.zeros_like(train.valid)
+    held[0] = True
+    data = Data(replace(train, key_points=points), None, held)
+    found = kernel_fit.fit_kernel(data, SPEC, True, 0, lambda *of: None)
+    assert found.held.tolist() == 60 * [True] + 60 * [False]
+    assert not found.predicted_mm.isnan().any()
+
+
 def test_effects_are_left_to_amend():
     with pytest.raises(InputError, match="kernel is fitted without any, and 'amend'"):
         fit(runs(range(6)), None, SPEC, replace(KERNEL, effects=("line_lag",)))

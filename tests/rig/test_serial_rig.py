@@ -18,6 +18,8 @@ from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import load_recording
 from surgisoft.rig import RigStopped, VirtualRig, guarded, open_rig
+from surgisoft.rig.drivers.line_protocol import Info, line, words_of
+from surgisoft.rig.drivers.serial_controller import SerialController
 from surgisoft.rig.emulator import emulated
 from surgisoft.rig.safety import Terminated
 from surgisoft.tasks.path_following import FollowConfig
@@ -202,6 +204,41 @@ def test_what_is_lost_on_the_way_is_counted_and_does_not_stop_the_run(bench):
     if not counts["late samples skipped"]:  # a busy computer skips them in one go
         assert 2 <= (~seen).sum() <= 12, "a lost frame is a sample without key points"
     assert np.ptp(points[seen][:, 1], axis=0).max() < 2.0, "labels were put right"
+
+
+def test_a_lost_answer_about_the_watchdog_is_asked_for_again():
+    tty = pytest.importorskip("tty", reason="Windows has no pseudo-terminals")
+    main, end = os.openpty()
+    tty.setraw(end)
+    over, asked = threading.Event(), []
+
+    def controller():
+        pending = b""
+        while not over.is_set():
+            if not select.select([main], [], [], 0.05)[0]:
+                continue
+            *lines, pending = (pending + os.read(main, 4096)).split(b"\n")
+            for kind, *rest in map(words_of, lines, ">" * len(lines)):
+                asked.append(kind)
+                if asked.count("WATCH") == 1:
+                    continue  # the answer is lost
+                hold, vent = map(int, rest) if kind == "WATCH" else (100, 400)
+                info = Info(3, -20.0, 60.0, hold, vent, "bench")
+                os.write(main, line(info.words(), "<"))
+
+    thread = threading.Thread(target=controller)
+    thread.start()
+    try:
+        found = SerialController(os.ttyname(end), hold_ms=700.0, vent_ms=900.0)
+        assert (found.info.hold_ms, found.info.vent_ms) == (700, 900)
+        assert asked.count("WATCH") >= 2
+        with pytest.raises(InputError, match="did not confirm that it vented"):
+            found.close()
+    finally:
+        over.set()
+        thread.join()
+        os.close(main)
+        os.close(end)
 
 
 def test_a_map_file_names_points_channels_and_the_frame(bench, tmp_path):

@@ -15,10 +15,10 @@ from surgisoft.rig.drivers.clock import ClockMap
 from surgisoft.rig.drivers.line_protocol import LONGEST, Data, Info, line, words_of
 
 ANSWER_S = 0.5
-"""Time in which a controller answers HELLO [s]."""
+"""Time in which a controller answers HELLO or WATCH [s]."""
 TRIES = 6
-"""Number of HELLOs before the driver gives up: a board that restarts when its port is opened needs
-about two seconds."""
+"""Number of HELLOs, and of WATCHes, before the driver gives up: a board that restarts when its port
+is opened needs about two seconds."""
 KEPT = 256
 """Reports that are kept for interpolation."""
 
@@ -96,9 +96,13 @@ class SerialController:
                 f"serial port '{self.port}': no pressure controller answers (HELLO sent {TRIES} "
                 f"times, {self.damaged} damaged lines heard); is it the right port and baud rate?"
             )
-        self._found = None
-        self._write(f"WATCH {round(hold_ms)} {round(vent_ms)}")
-        found = self._answered()
+        found = None
+        for _ in range(TRIES):  # a line or its answer may be damaged on the way
+            self._found = None
+            self._write(f"WATCH {round(hold_ms)} {round(vent_ms)}")
+            found = self._answered()
+            if found:
+                break
         if found is None or (found.hold_ms, found.vent_ms) != (round(hold_ms), round(vent_ms)):
             got = f"{found.hold_ms} and {found.vent_ms} ms" if found else "no answer"
             raise InputError(

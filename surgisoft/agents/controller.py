@@ -21,7 +21,7 @@ from surgisoft.errors import InputError
 from surgisoft.tasks.base import FEED_SIGNAL, Episodes, MeasuredTask, Signal, Task, TaskState
 from surgisoft.tasks.describe import field_docs
 from surgisoft.tasks.world.adaptation import Adaptation
-from surgisoft.tasks.world.arm import ArmPart, ModelArm
+from surgisoft.tasks.world.arm import ArmPart, ModelArm, require_kPa
 from surgisoft.tasks.world.pytree import tree_map
 from surgisoft.tasks.world.random_streams import Stream
 from surgisoft.tasks.world.scene import SceneEngine, SceneState
@@ -58,6 +58,7 @@ class MeasuredArm:
 
     def __init__(self, arm: ModelArm, gains: ObserverGains, dt_s: float):
         """arm: the simulated arm of the task; dt_s: time of a step, s."""
+        require_kPa(arm, "an exported controller")
         self.simulated = arm
         self.observer = Observer(arm, gains, dt_s, arm.low, arm.high)
         self.name, self.device, self.vary = arm.name, arm.device, arm.vary

@@ -38,7 +38,7 @@ from surgisoft.scene import frames
 from surgisoft.surrogate.reach import steady_key_points
 from surgisoft.tasks.base import Task
 from surgisoft.tasks.world.adaptation import Adaptation
-from surgisoft.tasks.world.arm import ArmPart, ModelArm
+from surgisoft.tasks.world.arm import ArmPart, ModelArm, require_kPa
 from surgisoft.tasks.world.pytree import ObjectBatch
 from surgisoft.tasks.world.random_streams import Stream
 
@@ -222,6 +222,7 @@ class RigArm:
                 f"arm '{arm.name}' has {arm.chambers} chambers and {arm.key_points} key points; "
                 f"the rig's has {rig.chambers} and {rig.key_planes}"
             )
+        require_kPa(arm, "a rig")
         if rig.unit != "kPa":
             raise InputError(f"arm '{arm.name}' is commanded in kPa, the rig in {rig.unit}")
         reads = round(dt_s / rig.period_s)

@@ -35,7 +35,7 @@ def privileged_state(arm: ModelArm, part: ArmPart) -> Tensor:
     off = part.points_mm - part.seen_mm
     shift = part.mount[:, :3, 3] - arm.pose[:3, 3]
     turn = 100.0 * (part.mount[:, :3, :3] - arm.pose[:3, :3])
-    known = [off.flatten(1), 10.0 * (part.gain - 1.0), shift, turn.flatten(1)]
+    known = [off.flatten(1), 10.0 * (part.gain / arm.per_kPa - 1.0), shift, turn.flatten(1)]
     return torch.cat(known if part.factors is None else [*known, part.factors], 1)
 
 

@@ -2,27 +2,17 @@
 
 from surgisoft.config import Where
 from surgisoft.measurement.recordings.columns import MM_PER
+from surgisoft.surrogate.units import KPA_PER
 
 SECONDS_PER = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 """Seconds in each unit of time."""
 
-_KPA_PER = {
-    "Pa": 1e-3,
-    "hPa": 0.1,
-    "kPa": 1.0,
-    "MPa": 1e3,
-    "mbar": 0.1,
-    "bar": 100.0,
-    "psi": 6.894757293168361,  # 0.45359237 kg * 9.80665 m/s2 / (0.0254 m)^2, NIST SP 811 (2008) B.8
-    "atm": 101.325,  # NIST SP 811 (2008) B.8
-    "mmHg": 0.133322387415,  # 13595.1 kg/m3 * 9.80665 m/s2 * 1 mm, NIST SP 811 (2008) B.8
-}
 _DEGREES_PER = {"deg": 1.0, "rad": 57.29577951308232, "rev": 360.0}
 _VOLTS_PER = {"V": 1.0, "mV": 1e-3}
 _NEWTONS_PER = {"N": 1.0, "mN": 1e-3, "kN": 1e3}
-ACTUATION_UNITS = (*_KPA_PER, *_DEGREES_PER, *_VOLTS_PER, *_NEWTONS_PER)
+ACTUATION_UNITS = (*KPA_PER, *_DEGREES_PER, *_VOLTS_PER, *_NEWTONS_PER)
 """Units of pressures, angles, voltages and forces."""
-_QUANTITIES = (_KPA_PER, _DEGREES_PER, MM_PER, _VOLTS_PER, _NEWTONS_PER)
+_QUANTITIES = (KPA_PER, _DEGREES_PER, MM_PER, _VOLTS_PER, _NEWTONS_PER)
 
 
 def factor(unit: str, to: str) -> float | None:

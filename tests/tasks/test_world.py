@@ -8,16 +8,25 @@ import numpy as np
 import pytest
 import torch
 
+from surgisoft.agents.controller import ControllerGraph
+from surgisoft.agents.on_rig import on_rig
+from surgisoft.agents.policies import Scripted
+from surgisoft.agents.rollout import rollout
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.folder import open_scene
 from surgisoft.surrogate.arm import ArmSpec
-from surgisoft.surrogate.checkpoint import default_arm
+from surgisoft.surrogate.checkpoint import default_arm, save_model
 from surgisoft.surrogate.model import ArmModel
-from surgisoft.surrogate.networks import HawNN
+from surgisoft.surrogate.networks import ConstantCurvature
+from surgisoft.tasks.base import Episodes
+from surgisoft.tasks.path_following import FollowConfig
+from surgisoft.tasks.registry import config_of, make_task, with_fields
+from surgisoft.tasks.track import TrackConfig
 from surgisoft.tasks.world.arm import Pneumatics, Randomisation
+from surgisoft.tasks.world.observer import AlphaBetaFilter
 from surgisoft.tasks.world.pytree import rows, tree_map
 from surgisoft.tasks.world.random_streams import streams
 from surgisoft.tasks.world.world import Mounted, World, WorldConfig, scene_world, single_arm_world
@@ -269,11 +278,73 @@ def test_a_donated_dose_map_is_overwritten_and_gives_the_same_dose(theatre):
     assert not kept.any(), "a step changed the state it was given"
 
 
-def test_an_arm_that_is_not_driven_in_kpa_is_refused():
-    spec = ArmSpec(1, 2, (0.0,), (90.0,), unit="deg")
-    network = HawNN(torch.tensor([0.0]), torch.tensor([90.0]), 2, (4,))
-    with pytest.raises(InputError, match="unit deg, expected kPa"):
-        World({"arm": Mounted(ArmModel(spec, network), torch.eye(4))})
+@pytest.fixture(scope="module")
+def tripod():
+    """Makes three chambers that bend one arc, of which each is driven from 0 to `high`, saved."""
+
+    def made(unit, high):
+        spec = ArmSpec(3, 5, (0.0,) * 3, (high,) * 3, unit=unit, length_mm=70.0)
+        network = ConstantCurvature(torch.zeros(3), torch.full((3,), high), key_points=5)
+        rest = torch.tensor([[0.0, 0.0, 17.5 * k] for k in range(5)])
+        network.set_rest(rest)
+        angle = torch.arange(3) * 2.0 * math.pi / 3.0
+        network.table.data[0, :2, :3] = 0.5 * torch.stack((angle.cos(), angle.sin()))
+        return ArmModel(spec, network, rest_mm=rest).eval().requires_grad_(False)
+
+    return made
+
+
+PSI = 6.894757
+"""kPa, NIST SP 811 (2008) B.8."""
+
+
+def test_an_arm_in_psi_moves_and_is_estimated_as_the_same_arm_in_kpa(tripod):
+    """Random gains and mounts, noise, delays, and an observer that learns; all in kPa outside."""
+    config = WorldConfig(randomisation=LIVELY, observer=AlphaBetaFilter(adapts=True))
+    one, other = (
+        World({"arm": Mounted(model, torch.eye(4))}, config)
+        for model in (tripod("kPa", 60.0), tripod("psi", 60.0 / PSI))
+    )
+    states = [world.start(streams(8, 4)) for world in (one, other)]
+    for action in [None, *actions_of(one, 4, 12)]:
+        if action is not None:
+            states = [w.step(s, action) for w, s in zip((one, other), states, strict=True)]
+        plain, psi = (state.arms["arm"] for state in states)
+        for name in ("command", "pressure", "seen_kPa", "points_mm", "seen_mm", "line_mm"):
+            found = getattr(psi, name).numpy()
+            np.testing.assert_allclose(found, getattr(plain, name), atol=2e-3, err_msg=name)
+    np.testing.assert_allclose(psi.arm.pressure * PSI, plain.arm.pressure, atol=1e-3)
+    at = torch.tensor([[10.0, 20.0, 30.0]])
+    settled = [world.arms["arm"].settled(at) for world in (one, other)]
+    np.testing.assert_allclose(*settled, atol=1e-3)
+
+
+def test_an_arm_in_degrees_follows_a_path(tripod, tmp_path):
+    """Its 90 degrees stand for 70 kPa; the expert holds the tip on the circle."""
+    save_model(tripod("deg", 90.0), tmp_path / "arm")
+    task = make_task("track_circle", TrackConfig(FollowConfig(arm=str(tmp_path / "arm"))))
+    assert task.world.arms["arm"].high.tolist() == pytest.approx([70.0] * 3)
+    found = rollout(task, Scripted(), 1, 0)
+    assert float(found.mean("error_mm")) < 0.05
+    with pytest.raises(InputError, match="is driven in deg, and a rig needs kPa"):
+        on_rig(task)
+    with pytest.raises(InputError, match="driven in deg, and an exported controller needs kPa"):
+        ControllerGraph(task, {})
+
+
+def test_a_scene_takes_arms_in_psi(tripod, tmp_path):
+    """Rewards of random actions are those of the same arms in kPa."""
+    rewards = []
+    for unit, high in (("kPa", 60.0), ("psi", 60.0 / PSI)):
+        save_model(tripod(unit, high), tmp_path / unit)
+        config = with_fields(config_of("circle_ablation"), arm=str(tmp_path / unit))
+        episodes = Episodes(make_task("circle_ablation", config))
+        state = episodes.seeded(2, 3)
+        for action in actions_of(episodes.task.world, 3, 4):
+            state, outcome = episodes.step(state, action)
+        rewards.append(outcome.rewards)
+    for agent, reward in rewards[0].items():
+        np.testing.assert_allclose(rewards[1][agent], reward, atol=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -17,11 +17,12 @@ from torch import Tensor
 
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
-from surgisoft.surrogate.arm import ArmState
+from surgisoft.surrogate.arm import ArmSpec, ArmState
 from surgisoft.surrogate.backbone import Backbone
 from surgisoft.surrogate.compiled_step import CompiledStep
 from surgisoft.surrogate.model import ArmModel
-from surgisoft.tasks.world.adaptation import DisturbanceEstimator
+from surgisoft.surrogate.units import KPA_PER
+from surgisoft.tasks.world.adaptation import AdaptationPrior, DisturbanceEstimator
 from surgisoft.tasks.world.compiled_arm import draw_body, drive, place
 from surgisoft.tasks.world.observer import AlphaBetaFilter, Belief
 from surgisoft.tasks.world.random_effects import RandomEffects
@@ -30,6 +31,9 @@ from surgisoft.tasks.world.random_streams import Stream
 STOOD = 40
 """Measurements at each pressure before an episode from which the observer learns, where it adapts:
 rigs are held there for 4 s."""
+STAND_IN_KPA = 70.0
+"""Range of pressures that stands for the widest range of an actuation that is no pressure, kPa:
+about that of the package's arm (69 kPa), for which the limits and noises of the tasks are made."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +122,7 @@ class Mounted:
     """An arm model and the place and orientation of its base."""
 
     model: ArmModel
-    """The arm, driven in kPa."""
+    """The arm; see `units_per_kPa` for one that is not driven in kPa."""
     pose: Tensor
     """(4, 4) base frame to world frame, mm."""
     start_kPa: tuple[float, ...] | None = None
@@ -140,7 +144,8 @@ class ArmPart:
     delay: Tensor
     """(B,) int64: delay of the episode's actions in steps, at most D."""
     gain: Tensor
-    """(B, m): gain of the episode between chamber pressure and the model's input."""
+    """(B, m): the model's actuation over the chamber pressure in the episode, in units of the model
+    per kPa (`units_per_kPa`)."""
     mount: Tensor
     """(B, 4, 4): this episode's base frame to world frame, mm."""
     arm: ArmState
@@ -242,6 +247,30 @@ class Arm(Protocol):
         """(B, m) kPa: the action that brings the chambers to `pressure` (B, m), if in reach."""
 
 
+def units_per_kPa(spec: ArmSpec) -> float:
+    """The actuation of an arm, in its own unit, that a pressure of 1 kPa of a task stands for.
+
+    1 for kPa; a unit of pressure is converted. An actuation that is no pressure (an angle, a
+    length, a voltage) is scaled, so that its widest range is `STAND_IN_KPA`.
+    """
+    if spec.unit in KPA_PER:
+        return 1.0 / KPA_PER[spec.unit]
+    return max(spec.span) / STAND_IN_KPA
+
+
+def require_kPa(arm: ModelArm, where: str) -> None:
+    """Raise an InputError for an arm that a controller outside of the simulation cannot drive.
+
+    where: what the arm was to be used for.
+    """
+    if arm.model.spec.unit != "kPa":
+        raise InputError(
+            f"arm '{arm.name}': its model is driven in {arm.model.spec.unit}, and {where} needs "
+            "kPa; convert the recordings by the map of 'surgisoft import' (to = 'kPa' for "
+            "pressures, scale for other quantities) and fit again"
+        )
+
+
 class ModelArm:
     """An `Arm` that a fitted arm model moves; holds no state."""
 
@@ -258,13 +287,10 @@ class ModelArm:
     ):
         """`samples` is the number K of centreline points; dt_s: time of a step of the world, s."""
         spec = mounted.model.spec
-        if spec.unit != "kPa":
-            raise InputError(
-                f"arm '{name}': its model has the unit {spec.unit}, expected kPa; convert the "
-                "recordings by the map of 'surgisoft import' (to = 'kPa' for pressures, scale for "
-                "other quantities) and fit again"
-            )
-        start = spec.rest if mounted.start_kPa is None else mounted.start_kPa
+        self.per_kPa = per_kPa = units_per_kPa(spec)
+        """The model's actuation for a pressure of 1 kPa, in the model's unit; 1 for kPa."""
+        rest = tuple(value / per_kPa for value in spec.rest)
+        start = rest if mounted.start_kPa is None else mounted.start_kPa
         if len(start) != spec.chambers:
             raise InputError(
                 f"arm '{name}': {len(start)} pressures to start with, expected {spec.chambers}"
@@ -278,7 +304,8 @@ class ModelArm:
         late = spec.actuation == "measured"
         self.pneumatics = pneumatics if late else replace(pneumatics, tau_s=0.0)
         row: dict[str, Any] = {"dtype": torch.float32, "device": device}
-        self.low, self.high = torch.tensor(spec.low, **row), torch.tensor(spec.high, **row)
+        self.low = torch.tensor(spec.low, **row) / per_kPa
+        self.high = torch.tensor(spec.high, **row) / per_kPa
         self.first = torch.tensor(start, **row)
         self.pose = mounted.pose.to(**row)
         self.shaft = torch.tensor([[0.0, 0.0, -mounted.shaft_mm]], **row)
@@ -287,7 +314,8 @@ class ModelArm:
         self._random_effects = RandomEffects(self.model) if randomisation.effects_mm > 0 else None
         self._learner = None
         if self.observer.adapts:
-            self._learner = DisturbanceEstimator(self.model, dt_s, device=device)
+            prior = AdaptationPrior(chambers_kPa=per_kPa * AdaptationPrior.chambers_kPa)
+            self._learner = DisturbanceEstimator(self.model, dt_s, prior, device)
 
     def reference(self) -> ModelArm:
         """This arm stepped by differentiable tensor operations alone, which agree to rounding."""
@@ -308,7 +336,7 @@ class ModelArm:
         stream, normal = stream.normal(m)
         stream, turn = stream.normal(6)
         stream, late = stream.uniform(0.0, vary.delay + 1.0)
-        gain = 1.0 + vary.gain * normal
+        gain = self.per_kPa * (1.0 + vary.gain * normal)
         pressure = (self.first + vary.start_kPa * spread).clamp(self.low, self.high)
         passed = (self.low + (self.high - self.low) * share).unbind(1)
         factors = None
@@ -351,14 +379,15 @@ class ModelArm:
         nominal = self.model.initial_state(count)
         learned = None if self._learner is None else self._learner.start(count)
         for number, target in enumerate((*passed, pressure)):
-            nominal, shape = self._advanced(nominal, target, 1.0)
+            nominal, shape = self._advanced(nominal, self.per_kPa * target, 1.0)
             if self._learner is None or learned is None:
                 continue
             at = stood[number]
             stream, noise = stream.normal(self.key_points, 3)
             seen = frames.apply(mount, at) + vary.noise_mm / math.sqrt(STOOD) * noise
             off = (seen - frames.apply(self.pose, shape)) @ self.pose[:3, :3]
-            learned = self._learner.updated(learned, off, target, shape, STOOD, True).memory
+            told = self.per_kPa * target
+            learned = self._learner.updated(learned, off, told, shape, STOOD, True).memory
         offset = part.seen_mm - frames.apply(self.pose, shape)
         zero = torch.zeros_like(offset)
         belief = Belief(nominal, offset, zero, zero[:, :1])
@@ -400,7 +429,7 @@ class ModelArm:
 
         The model's output for constant pressure, without any history of pressure changes.
         """
-        state = self.model.initial_state(len(pressure), pressure)
+        state = self.model.initial_state(len(pressure), self.per_kPa * pressure)
         _, points = self.model.step(state, torch.zeros_like(pressure), 1.0)
         return frames.apply(self.pose, points)
 
@@ -569,7 +598,7 @@ class ModelArm:
         belief = part.belief
         if belief is None:
             return part
-        arm, shape = self._advanced(belief.arm, part.seen_kPa, dt_s)
+        arm, shape = self._advanced(belief.arm, self.per_kPa * part.seen_kPa, dt_s)
         points = frames.apply(self.pose, shape) + belief.fed_mm
         off, lead = part.seen_mm - points, None
         belief = replace(belief, arm=arm)
@@ -588,9 +617,9 @@ class ModelArm:
         the belief after a measurement `off`; shape: (B, n, 3) mm, base frame, of the model."""
         assert self._learner is not None
         assert belief.adaptation is not None
-        turn = self.pose[:3, :3]
-        memory, now, lead = self._learner.updated(belief.adaptation, off @ turn, pressure, shape)
-        offset = self._learner.expected(memory, pressure) @ turn.mT
+        turn, told = self.pose[:3, :3], self.per_kPa * pressure
+        memory, now, lead = self._learner.updated(belief.adaptation, off @ turn, told, shape)
+        offset = self._learner.expected(memory, told) @ turn.mT
         belief = replace(belief, adaptation=memory, offset_mm=offset)
         return now @ turn.mT, lead @ turn.mT, belief
 

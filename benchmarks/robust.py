@@ -274,7 +274,7 @@ def _judged(cases: Sequence[Case], arm: Path | None, report: Progress) -> list[d
     that of the package.
     """
     one = cases[0]
-    task = _task(arm, one.poses)
+    task = robust_task(arm, one.poses)
     config = RigConfig(adapts=one.method.observer == LEARNS)
     place = on_rig(task, config, Robots(cases))
     policy = open_policy(one.method.policy, place)
@@ -315,7 +315,7 @@ class Robots:
         return named_rig(replace(config, seed=case.robot, hidden=hidden), trial)
 
 
-def _task(arm: Path | None, poses: int) -> Task:
+def robust_task(arm: Path | None, poses: int) -> Task:
     """The task with its usual rules, and the model of the package or one of the robot."""
     config: Any = with_fields(config_of(TASK), fire_mm=FIRE_MM)
     vary = replace(config.world.randomisation, history=poses)

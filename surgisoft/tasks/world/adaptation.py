@@ -181,7 +181,8 @@ class DisturbanceEstimator:
         prior: AdaptationPrior | None = None,
         device: str | torch.device = "cpu",
     ):
-        """model: the arm, in kPa; dt_s: time between two updates, s."""
+        """model: the arm; dt_s: time between two updates, s. Pressures, and `prior.chambers_kPa`,
+        are in the unit of the model, which is kPa unless it says otherwise."""
         self.prior = prior = prior or AdaptationPrior()
         spec = model.spec
         rest, low, high = (np.array(each) for each in (spec.rest, spec.low, spec.high))

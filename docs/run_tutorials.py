@@ -45,8 +45,8 @@ GALLERY = PAGES.parent / "gallery" / "index.md"
 """Pictures of tasks, replays and pages, each with the commands that made it."""
 MOST_PIXELS = 1000
 """Widest picture that is kept; all pictures together stay below 2 MB."""
-COLOURS = 128
-"""Colours of a picture that is kept."""
+COLOURS = 256
+"""Colours of a picture that is kept, as many as one byte of a pixel tells apart."""
 ROOT = PAGES.parents[1]
 NOT_RUN = {
     "docs/rigs.md": "drives the devices of a laboratory; a rig of four methods is run by own_rig",
@@ -306,7 +306,12 @@ def python(source: str, folder: Path, names: dict, page: str) -> str:
 
 
 def keep(made: Path, place: Path) -> None:
-    """Copy a picture, no wider than the page and with few colours."""
+    """Copy a picture, no wider than the page and with few colours.
+
+    The palette covers the colours that occur, however few pixels have them: a palette of equally
+    frequent colours (Pillow's default) takes the colour of thin lines away. k-means then moves each
+    colour to the mean of its pixels, without which broad areas are tinted.
+    """
     from PIL import Image
 
     place.parent.mkdir(exist_ok=True)
@@ -315,7 +320,7 @@ def keep(made: Path, place: Path) -> None:
         height = round(picture.height * MOST_PIXELS / picture.width)
         picture = picture.resize((MOST_PIXELS, height), Image.Resampling.LANCZOS)
     shutil.rmtree(place, ignore_errors=True)
-    picture.quantize(COLOURS).save(place, optimize=True)
+    picture.quantize(COLOURS, Image.Quantize.MAXCOVERAGE, kmeans=1).save(place, optimize=True)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,9 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from surgisoft.tasks.registry import TASKS
 
@@ -78,6 +80,17 @@ def test_every_picture_is_made_by_its_page_and_all_are_small():
     kept = list((DOCS / "tutorials" / "images").iterdir())
     assert shown == {path.name for path in kept}
     assert sum(path.stat().st_size for path in kept) < 2_000_000
+
+
+def test_a_kept_picture_keeps_the_colour_of_a_thin_line(tmp_path):
+    """A yellow path is a thousandth of a picture whose shades are many."""
+    shades = np.random.default_rng(0).integers(90, 255, (400, 800))
+    pixels = np.stack((shades, shades, np.roll(shades, 1)), -1).astype(np.uint8)
+    pixels[200, 100:420] = yellow = (250, 200, 20)
+    Image.fromarray(pixels).save(tmp_path / "made.png")
+    tutorials.keep(tmp_path / "made.png", tmp_path / "images" / "kept.png")
+    kept = np.asarray(Image.open(tmp_path / "images" / "kept.png").convert("RGB"), int)
+    assert np.abs(kept[200, 100:420] - yellow).max() < 30
 
 
 def test_every_output_of_a_tutorial_was_written():

@@ -23,7 +23,7 @@ def demo(
     """
     from surgisoft.demonstration import demo as run_demo
 
-    steps = count(1)
+    steps, began = count(1), False
 
     def show(name: str, sentence: str) -> None:
         number = next(steps)
@@ -34,7 +34,15 @@ def demo(
             )
 
     with progress("demo") as report:
-        result = run_demo(output, progress=report, on_step=show)
+
+        def told(done: float, total: float, note: str = "") -> None:
+            nonlocal began
+            if not began:
+                print(f"five steps, into {output}; a first run compiles for a minute", flush=True)
+            began = True
+            report(done, total, note)
+
+        result = run_demo(output, progress=told, on_step=show)
     if result.no_picture:
         print(f"no picture of the replay: {result.no_picture}")
     show_written([result.page, output / "cut.rrd"])

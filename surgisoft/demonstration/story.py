@@ -24,7 +24,7 @@ from surgisoft.diagnosis.pages.diagnosis import diagnosis_page
 from surgisoft.diagnosis.residuals import residual_table
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import load_recordings
-from surgisoft.progress import Progress, silent
+from surgisoft.progress import Progress, Stages, silent
 from surgisoft.replay.episode_view import write_replay
 from surgisoft.replay.model_error import write_compared, write_models
 from surgisoft.replay.show import open_replay
@@ -90,7 +90,6 @@ def demo(
     """
     folder = Path(folder)
     _claim(folder)
-    progress(0, 100, "step 1 of 5: two arms cut a ring")
     folder.mkdir(parents=True, exist_ok=True)
     try:
         with _recorder(folder / RECORDING) as recorded:
@@ -112,10 +111,18 @@ def _five_steps(
     recorded: waits for the recording, which is made meanwhile.
     """
     story = _Story(folder / "index.html", on_step)
-    cut = evaluate(policy, "circle_ablation", episodes=1, log=(str(policy),))
+    stages = Stages(progress, 100)
+    cutting = stages.stage(25, "step 1 of 5: two arms cut a ring")
+    cut = evaluate(
+        policy,
+        "circle_ablation",
+        episodes=1,
+        log=(str(policy),),
+        progress=lambda done, total, _="": cutting(done, total),
+    )
     log = cut.logs[str(policy)]
     write_replay(log, folder / "cut.rrd")
-    progress(25, 100, "step 1 of 5: picture of the replay")
+    stages.stage(15, "step 1 of 5: picture of the replay")
     picture, no_picture = _replay_picture(folder / "cut.rrd", folder / "cut.png")
     story.tell(
         f"evaluate {policy} --episodes 1 --replay cut.rrd",
@@ -123,7 +130,7 @@ def _five_steps(
         _cut_parts(log, picture),
     )
 
-    progress(40, 100, "step 2 of 5: a robot is recorded")
+    stages.stage(20, "step 2 of 5: a robot is recorded")
     recorded()
     story.tell(
         " ".join(_collect_arguments(RECORDING)),
@@ -131,7 +138,7 @@ def _five_steps(
         MEASURED,
     )
 
-    progress(60, 100, "step 3 of 5: the model is compared with it")
+    stages.stage(10, "step 3 of 5: the model is compared with it")
     comparison, table = compare("default", folder / RECORDING)
     compared = [Compared("default", comparison, table)]
     _, *drawn = write_report(compared, folder / "compare", "default on bench")
@@ -142,12 +149,12 @@ def _five_steps(
         _error_pictures(drawn),
     )
 
-    progress(70, 100, "step 4 of 5: which effect is missing?")
+    stages.stage(10, "step 4 of 5: which effect is missing?")
     found = diagnose("default", folder / RECORDING)
     write_page(diagnosis_page(found, "default"), folder / "diagnosis.html")
     story.tell(f"diagnose default {RECORDING}", found.verdict.sentence, _ranking_parts(found))
 
-    progress(80, 100, "step 5 of 5: the effect is added")
+    stages.stage(20, "step 5 of 5: the effect is added")
     amendment, command = None, ""
     if found.verdict.effects:
         names = " ".join(found.verdict.effects)

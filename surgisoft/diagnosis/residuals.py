@@ -209,6 +209,11 @@ class ResidualTable:
         """(N,) time on the axis that charts and replays share: all recordings in turn, s."""
         return continued(self.t_s)
 
+    def recorded_s(self, recording: int) -> float:
+        """Time of all runs of a recording, by its number, s; pauses between runs do not count."""
+        own = self.recording == recording
+        return sum(float(np.ptp(self.t_s[own & (self.run == run)])) for run in set(self.run[own]))
+
     @property
     def error_mm(self) -> np.ndarray:
         """(N, n) distance between predicted and measured key points, mm; NaN where missing."""

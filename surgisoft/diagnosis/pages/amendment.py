@@ -239,7 +239,8 @@ def write_improve_report(
     if before.spec.key_points > 1:
         # The held-out part, as in the numbers on top; without a step both bodies are the same.
         shown = {name: table.only("held_out") for name, table in tables.items()}
-        figure = bodies(shown if result.steps else {"before": shown["before"]}, title)
+        where = f"held-out part of {', '.join(before.names)}"
+        figure = bodies(shown if result.steps else {"before": shown["before"]}, where)
         drawn.append(save(figure, folder / "bodies.png"))
     picture = drawn[0] if drawn else None
     page = improve_page(result, title, result.model.summary(), before, picture)
@@ -256,13 +257,12 @@ def _measured(table: ResidualTable) -> Section:
     for number, name in enumerate(table.names):
         own = table.recording == number
         pressure = table.pressure[own]
-        time_s = table.t_s[own]
         timed = bool(table.timed[own].any())
         rows.append(
             (
                 name,
                 f"{own.sum():,}",
-                f"{(time_s[-1] - time_s[0]) / 60:.1f} min" if timed else "steady-state samples",
+                f"{table.recorded_s(number) / 60:.1f} min" if timed else "steady-state samples",
                 f"{len(np.unique(table.run[own]))}",
                 f"{np.nanmin(pressure):.3g} .. {np.nanmax(pressure):.3g} {spec.unit}",
                 f"{100 * table.held_out[own].mean():.0f} %",

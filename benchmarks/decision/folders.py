@@ -5,8 +5,8 @@ effects, the names that a diagnosis should give, RMS change of the key points in
 `same_rows`: whether the same rows are in `before`, so that the paired difference shows the change
 alone), and for each robot `before/*.parquet` and optionally `model/`, in `ROBOT` or
 `robots/ROBOT`. One model is fitted for each robot to its recordings before the change, unless it is
-there already. The question is what has changed since: the recordings before the change are given to
-the diagnosis too.
+there already; `fit` in the robot's `robot.json` may state its budget (fields of `FitConfig`). The
+question is what has changed since: the recordings before the change are given to the diagnosis too.
 
 Where the truth is all that a model lacks, each robot gives two cases more, of a model that is off:
 its first unchanged recording is asked of a model that was fitted for a few epochs, and of the model
@@ -63,8 +63,10 @@ def model_folder(folder: Path, robot: str, work: Path, undertrained: bool = Fals
         return place / "model"
     own = work / f"{folder.name}-{robot}{'-undertrained' if undertrained else ''}"
     if not (own / "config.json").is_file():
-        epochs = {"epochs": FEW_EPOCHS} if undertrained else {}
-        result = fit(place / "before", effects=FIT_EFFECTS, **epochs)
+        about = place / "robot.json"
+        budget = json.loads(about.read_text()).get("fit", {}) if about.is_file() else {}
+        few = {"epochs": FEW_EPOCHS} if undertrained else {}
+        result = fit(place / "before", effects=FIT_EFFECTS, **budget | few)
         own.parent.mkdir(parents=True, exist_ok=True)
         save_model(result.model, own, result.report(), force=True, known=result.known)
     return own

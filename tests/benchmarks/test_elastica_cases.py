@@ -7,12 +7,11 @@ import pytest
 
 pytest.importorskip("elastica", reason="PyElastica is not installed (extra `elastica`)")
 
-from benchmarks import elastica_cases
-from benchmarks.elastica_cases import (
+from benchmarks import elastica_cases, rig_cases
+from benchmarks.elastica_cases import GENERATOR
+from benchmarks.rig_cases import (
     ALIKE,
     KNOWN,
-    MORE_UNKNOWN,
-    UNKNOWN,
     Case,
     cases,
     load_case,
@@ -25,9 +24,9 @@ from surgisoft.measurement.recordings import load_recording
 
 
 def test_a_round_holds_every_effect_pairs_and_clean_robots():
-    planned = cases([1, 2, 3], 25, seed=4)
+    planned = cases(GENERATOR, [1, 2, 3], 25, seed=4)
     single = {case.names[0] for case in planned if len(case.names) == 1}
-    assert single == {*KNOWN, *UNKNOWN}
+    assert single == {*KNOWN, *GENERATOR.unknown}
     assert sum(case.names == () for case in planned) == 4
     assert sum(len(case.names) == 2 for case in planned) == 2
     assert {case.robot for case in planned} == {1, 2, 3}
@@ -36,9 +35,9 @@ def test_a_round_holds_every_effect_pairs_and_clean_robots():
 
 
 def test_the_plan_follows_from_its_seed_and_only_grows():
-    longer = cases([1, 2, 3], 60, seed=4)
-    assert longer[:25] == cases([1, 2, 3], 25, seed=4)
-    assert longer[:25] != cases([1, 2, 3], 25, seed=5)
+    longer = cases(GENERATOR, [1, 2, 3], 60, seed=4)
+    assert longer[:25] == cases(GENERATOR, [1, 2, 3], 25, seed=4)
+    assert longer[:25] != cases(GENERATOR, [1, 2, 3], 25, seed=5)
 
 
 def test_pairs_are_every_two_that_are_not_alike_and_have_a_plan_of_their_own():
@@ -50,28 +49,30 @@ def test_pairs_are_every_two_that_are_not_alike_and_have_a_plan_of_their_own():
     assert all(len(set(case.truth)) == 2 for case in planned)
     assert [case.robot for case in planned[:4]] == [1, 2, 3, 1]
     assert planned[:20] == pairs([1, 2, 3], 20, seed=4)
-    assert len({case.name for case in [*planned, *cases([1], 101, seed=4)]}) == 202
+    assert len({case.name for case in [*planned, *cases(GENERATOR, [1], 101, seed=4)]}) == 202
 
 
 def test_unknown_effects_of_every_kind_come_in_turn():
-    planned = unknowns([1, 2], 2 * len(MORE_UNKNOWN), seed=4)
-    for part in (planned[: len(MORE_UNKNOWN)], planned[len(MORE_UNKNOWN) :]):
-        assert {case.names[0] for case in part} == set(MORE_UNKNOWN) > set(UNKNOWN)
+    planned = unknowns(GENERATOR, [1, 2], 2 * len(GENERATOR.more_unknown), seed=4)
+    for part in (planned[: len(GENERATOR.more_unknown)], planned[len(GENERATOR.more_unknown) :]):
+        assert (
+            {case.names[0] for case in part} == set(GENERATOR.more_unknown) > set(GENERATOR.unknown)
+        )
     assert all(case.truth == ["unknown"] for case in planned)
 
 
 @pytest.fixture
 def brief(monkeypatch):
     """Recordings of a few seconds."""
-    for name in ("BEFORE_S", "AFTER_S"):
-        monkeypatch.setattr(elastica_cases, name, dict.fromkeys(getattr(elastica_cases, name), 4.0))
-    monkeypatch.setattr(elastica_cases, "TRIED_S", 4.0)
+    for module, name in ((elastica_cases, "BEFORE_S"), (rig_cases, "AFTER_S")):
+        monkeypatch.setattr(module, name, dict.fromkeys(getattr(module, name), 4.0))
+    monkeypatch.setattr(rig_cases, "TRIED_S", 4.0)
 
 
 def test_a_case_repeats_the_actuation_and_differs_by_its_effect(tmp_path, brief):
-    make_robot(tmp_path, 2)
-    make_case(tmp_path, Case(0, 2, ("payload",), 1.0, "same"))
-    make_case(tmp_path, Case(1, 2, (), 1.0, "same"))
+    make_robot(GENERATOR, tmp_path, 2)
+    make_case(GENERATOR, tmp_path, Case(0, 2, ("payload",), 1.0, "same"))
+    make_case(GENERATOR, tmp_path, Case(1, 2, (), 1.0, "same"))
     truth, before, after = load_case(tmp_path, "000")
     assert truth["truth"] == ["payload"]
     assert truth["same_actuation"]
@@ -87,9 +88,9 @@ def test_a_case_repeats_the_actuation_and_differs_by_its_effect(tmp_path, brief)
 
 def test_a_pair_states_what_each_effect_changes(tmp_path, brief):
     """Each alone, on the actuation of the recording; so the two obey the triangle inequality."""
-    make_robot(tmp_path, 2)
-    make_case(tmp_path, Case(3, 2, ("payload", "misalignment"), 1.0, "mixed", "pair"))
-    make_case(tmp_path, Case(4, 2, ("payload",), 1.0, "mixed"))
+    make_robot(GENERATOR, tmp_path, 2)
+    make_case(GENERATOR, tmp_path, Case(3, 2, ("payload", "misalignment"), 1.0, "mixed", "pair"))
+    make_case(GENERATOR, tmp_path, Case(4, 2, ("payload",), 1.0, "mixed"))
     truth, _, _ = load_case(tmp_path, "pair-003")
     single, _, _ = load_case(tmp_path, "004")
     each = {one["effect"]: one["change_rms_mm"] for one in truth["hidden"]}
@@ -100,10 +101,10 @@ def test_a_pair_states_what_each_effect_changes(tmp_path, brief):
 
 
 def test_what_exists_is_kept(tmp_path, brief):
-    make_robot(tmp_path, 2)
+    make_robot(GENERATOR, tmp_path, 2)
     file = tmp_path / "robots" / "2" / "before" / "mixed.parquet"
     stamp = file.stat().st_mtime_ns
-    make_robot(tmp_path, 2)
+    make_robot(GENERATOR, tmp_path, 2)
     assert file.stat().st_mtime_ns == stamp
     assert load_recording(file).noise_mm == pytest.approx(0.04, abs=0.01)
     about = json.loads((tmp_path / "robots" / "2" / "robot.json").read_text())

@@ -1,0 +1,1 @@
+"""A third generator of robots: an overdamped chain of rigid links under weight and pressure."""

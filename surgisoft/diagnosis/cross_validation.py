@@ -19,6 +19,8 @@ from surgisoft.diagnosis.residuals import Problem
 
 RIDGES = (1e-4, 1e-2, 1e-1)
 """Ridges on amplitudes, shares of a column's own power; the best on held-out blocks is taken."""
+ROUNDING = 2.0**-24
+"""Relative rounding error of a number in single precision."""
 INDUCING = 120
 """Features of the model discrepancy (Nystroem: Williams & Seeger 2001)."""
 ROOM = 3.0
@@ -362,10 +364,14 @@ def _sum_squares(held_out, rows, amplitudes, fold, losses):
 
     held_out (L, C, C, B) products G of all columns; rows (1 + k,) those that are looked at;
     amplitudes (L, r, folds, k); fold (B,) of each block.
+
+    G is rounded to single precision, so that a sum is not known better than ROUNDING times the
+    largest products in it. Where large amplitudes of nearly collinear columns cancel, the rest
+    can come out too small and even negative; it is at least its own rounding error.
     """
     levels, ridges, blocks = losses.shape
     size = len(rows)
-    mix, along = np.ones((size, blocks)), np.empty(blocks)
+    mix, along, least = np.ones((size, blocks)), np.empty(blocks), np.empty(blocks)
     for level in range(levels):
         for ridge in range(ridges):
             total = losses[level, ridge]
@@ -373,14 +379,19 @@ def _sum_squares(held_out, rows, amplitudes, fold, losses):
                 for block in range(blocks):
                     mix[i, block] = -amplitudes[level, ridge, fold[block], i - 1]
             total[:] = 0.0
+            least[:] = 0.0
             for i in range(size):
                 along[:] = 0.0
                 for j in range(size):
                     product = held_out[level, rows[i], rows[j]]
                     for block in range(blocks):
                         along[block] += product[block] * mix[j, block]
+                own = held_out[level, rows[i], rows[i]]
                 for block in range(blocks):
                     total[block] += mix[i, block] * along[block]
+                    least[block] += own[block] * mix[i, block] * mix[i, block]
+            for block in range(blocks):
+                total[block] = max(total[block], ROUNDING * least[block])
 
 
 def _amplitudes(gram: np.ndarray) -> np.ndarray:

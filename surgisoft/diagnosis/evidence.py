@@ -227,7 +227,7 @@ def evidence_of(found: Findings) -> Evidence:
         held_static=_share(raw.sum() - null.sum(), above),
         free_static=_share(raw.sum() - box.static_losses.sum(), above),
         free_box=_share(raw.sum() - free.sum(), above),
-        error_over_box=math.sqrt(max(raw.sum() / free.sum(), 1.0)),
+        error_over_box=math.sqrt(max(raw.sum() / max(free.sum(), 1e-30), 1.0)),
         box_gain=_share(null.sum() - box.losses.sum(), beside),
         box_log_gain=float(selection.log_ratio(null, box.losses).mean()),
         box_z=normal_quantile(box.p_value),

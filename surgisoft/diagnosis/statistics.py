@@ -15,6 +15,8 @@ from scipy.linalg import cho_factor, cho_solve
 DRAWS = 2000
 """Random draws of every bootstrap and of every sign-flip test. The end of a 95 % interval then has
 a Monte Carlo error of a fifteenth of the standard error, a p-value of 0.02 one of 0.003."""
+LEAST_VARIANCE = 1e-12
+"""Least variance of an estimate beside the largest one; keeps weights of exact estimates finite."""
 LEVEL = 0.95
 """Confidence level of the intervals."""
 PENALTIES = (1e-3, 1e-2, 1e-1)
@@ -99,11 +101,15 @@ def variance_between(estimates: np.ndarray, variances: np.ndarray) -> float:
 
     The moment estimator of random effects (DerSimonian & Laird 1986, "Meta-analysis in clinical
     trials", eq. 8): by how much the heterogeneity Q of Cochran 1954 exceeds its expected value
-    under one common value, M - 1. 0 where it does not. variances: (M,) of the estimates.
+    under one common value, M - 1. 0 where it does not. variances: (M,) of the estimates; where
+    they are all 0 the quantity is known in each sample, and this is the variance of its values.
     """
     if len(estimates) < 2:
         return 0.0
-    weights = 1.0 / variances
+    largest = float(np.max(variances))
+    if not largest > 0.0:
+        return float(np.var(estimates, ddof=1))
+    weights = 1.0 / np.maximum(variances, LEAST_VARIANCE * largest)
     mean = weights @ estimates / weights.sum()
     excess = weights @ np.square(estimates - mean) - (len(estimates) - 1)
     unit = weights.sum() - np.square(weights).sum() / weights.sum()

@@ -129,3 +129,25 @@ def test_contributions_are_products_of_what_effects_explain(data):
     mix = np.array([1.0, -1.0, -1.0])
     left = np.einsum("i,bij,j->b", mix, products, mix)
     assert left == pytest.approx(found.losses((0, 1, 2)), rel=0.05)
+
+
+def test_a_held_out_error_is_no_less_than_its_rounding_error():
+    """Two columns that are large and equal where the rows are held out, and are subtracted there.
+
+    The residual is their difference, so that what is left after the fit is the difference of
+    products as large as 1e10 mm^2 in single precision: without a bound it comes out negative.
+    """
+    worst = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        block = np.arange(ROWS) * BLOCKS // ROWS
+        common, apart = rng.normal(size=(2, ROWS, POINTS, 3))
+        common[block == 3] *= 1e4
+        apart[block == 3] *= 1e-3
+        columns = np.stack([common + apart, common - apart], axis=3)
+        validation = cross_validated(
+            np.zeros((ROWS, 1)), 2.0 * apart, columns, block, np.arange(BLOCKS),
+            np.full(POINTS, 0.01), np.full(POINTS, 0.01),
+        )  # fmt: skip
+        worst.append(validation.losses((0, 1))[3])
+    assert min(worst) >= 0.5e8 * 2.0**-24

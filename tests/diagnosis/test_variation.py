@@ -25,6 +25,8 @@ def test_variance_between_samples_by_hand():
     found = variance_between(np.array([0.0, 4.0, 2.0]), variances)
     assert found == pytest.approx(6.0 / (2.25 - 2.0625 / 2.25))
     assert variance_between(np.array([3.0]), np.array([0.1])) == 0.0
+    assert variance_between(np.array([0.0, 4.0, 2.0]), np.zeros(3)) == pytest.approx(4.0)
+    assert variance_between(np.array([2.0, 2.0]), np.array([0.0, 0.1])) == 0.0
 
 
 def test_variance_between_is_that_which_was_drawn():

@@ -48,7 +48,7 @@ def test_five_steps_with_their_pictures(tmp_path, monkeypatch, capsys):
     assert base64.b64encode(shown[0]).decode() in page
     # a second call keeps the first one's files
     assert run(["demo", "-o", str(folder)]) == 2
-    assert "already there" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err
 
 
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path):

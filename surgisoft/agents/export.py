@@ -62,7 +62,7 @@ def export(
     task: where the policy acts, None: the task of its run. gains: of the observer.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: already there; choose another name")
+        raise InputError(f"{folder}: already exists; choose another name")
     task = task or policy.run.task()
     with new_folder(folder) as fresh:
         written = []

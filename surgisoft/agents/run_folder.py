@@ -105,11 +105,11 @@ def check_free(folder: Path) -> None:
         raise InputError(f"{folder}: cannot be written, {above} is not a writable folder")
     if (folder / "config.json").is_file():
         raise InputError(
-            f"{folder}: a run is already there; continue it with --resume {folder} or choose "
+            f"{folder}: a run exists already; continue it with --resume {folder} or choose "
             "another name"
         )
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: already there; choose another name")
+        raise InputError(f"{folder}: already exists; choose another name")
 
 
 def create_run(folder: Path, plan: Plan, task: Task, agents: dict, processes: int) -> RunFolder:

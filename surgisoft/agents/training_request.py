@@ -145,7 +145,7 @@ def train(
 
 
 def shortfall(run: TrainedRun) -> str:
-    """Why a finished training did not come far, in words; empty where it did.
+    """Why a finished training did not converge, in words; empty where it did.
 
     It did not where its best policies do not succeed in every episode, or, in a task without
     success, where they are farther off than the arm model itself is.
@@ -168,7 +168,7 @@ def shortfall(run: TrainedRun) -> str:
     task = RunFolder(run.folder).config["task"]
     usual = steps_for("fast", task)
     more = f"train longer ({usual:,} steps are usual) or " if run.result.steps < usual else ""
-    return f"the training did not come far: {why}; {more}try another --seed"
+    return f"the training did not converge: {why}; {more}try another --seed"
 
 
 def _new_folder(task: str, output: str | Path | None) -> Path:

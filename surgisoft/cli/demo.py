@@ -29,9 +29,7 @@ def demo(
         number = next(steps)
         print(f"{number}. {name}: {sentence}", flush=True)
         if number == 1:
-            print(
-                f"   its picture: {output / 'index.html'}, which grows with each step", flush=True
-            )
+            print(f"   see {output / 'index.html'}; each further step adds its result", flush=True)
 
     with progress("demo") as report:
 

@@ -25,7 +25,7 @@ def check_free(path: Path | None, field: str) -> None:
     except (OSError, ValueError):
         same = False
     if not same:
-        raise InputError(f"{path}: already there and not an older result; choose another file")
+        raise InputError(f"{path}: exists already and is not an older result; choose another file")
 
 
 def check_folder(path: Path | None) -> None:

@@ -259,7 +259,7 @@ def assess(
     for source in context.sources:
         if source.name not in known:
             raise InputError(
-                f"sources: '{source.name}' is no recording of this comparison, expected one of "
+                f"sources: '{source.name}' is not a recording of this comparison, expected one of "
                 f"{', '.join(sorted(known))}"
             )
     episodes = stored_episodes(context.scenario)

@@ -169,7 +169,7 @@ def _five_steps(
         write_models(tables, title, folder / "amended.rrd", amendment.sentence)
     story.tell(
         command,
-        amendment.sentence if amendment else "no effect was named to add",
+        amendment.sentence if amendment else "no effect was named, so none was added",
         _amended_parts(amendment),
         tone="good" if amendment is not None and amendment.claimed else "warn",
     )
@@ -214,7 +214,7 @@ def _collect_arguments(file: str) -> list[str]:
 def _claim(folder: Path) -> None:
     """Raise InputError unless the folder can be made, or is empty."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: already there; choose another folder with -o")
+        raise InputError(f"{folder}: already exists; choose another folder with -o")
     if folder.resolve() == Path.cwd():
         raise InputError(f"{folder}: is the present folder, expected a new one; name it with -o")
     above = next(place for place in folder.absolute().parents if place.exists())
@@ -258,8 +258,8 @@ class _Story:
         left = len(STEPS) - number
         verdict = said
         if left:
-            steps = "a step follows" if left == 1 else f"{left} steps follow"
-            verdict = f"{said} This page grows: {steps}, reload it."
+            steps = "One more step follows" if left == 1 else f"{left} more steps follow"
+            verdict = f"{said} {steps}; reload this page to see the results so far."
         page = Page("surgisoft in five steps", verdict, self.sections, "surgisoft demo", tone)
         write_page(page, self.page)
         self.on_step(name, sentence)

@@ -680,19 +680,20 @@ def load_decision(path: Path = ASSET) -> DecisionModel:
         numbers = (*weights.values(), one.get("constant"))
         if not all(_finite(v) for v in numbers):
             raise InputError(
-                f"{path.name}: model '{name}' has a weight that is no finite number; fit it again"
+                f"{path.name}: model '{name}' has a weight that is not a finite number; fit it "
+                "again"
             )
         models[name] = Logistic(tuple(map(float, weights.values())), numbers[-1])
     curves = values.get("calibration", {})
     if not isinstance(curves, dict):
-        raise InputError(f"{path.name}: calibration is no table; fit it again")
+        raise InputError(f"{path.name}: calibration is not a table; fit it again")
     for name, one in curves.items():
         given = _table(one)
         if name not in CALIBRATED or not all(_finite(given.get(k)) for k in ("constant", "slope")):
             raise InputError(f"{path.name}: calibration '{name}' is not readable; fit it again")
     for name in CHOSEN_COSTS:
         if not _finite(values.get(name, getattr(WORTH, name))):
-            raise InputError(f"{path.name}: {name} is no finite number; fit it again")
+            raise InputError(f"{path.name}: {name} is not a finite number; fit it again")
     return decision_of(models, values)
 
 

@@ -29,7 +29,7 @@ REASONS = {
     "actuation; record ramps that turn back at different levels",
     "no_change": "it changes nothing along this actuation, or needs a quantity that was not "
     "recorded",
-    "no_slope": "it acts on the actuation, and the model's predictions are no function of the "
+    "no_slope": "it acts on the actuation, and the model's predictions are not a function of the "
     "actuation and its past that could be fitted to them; give the model as a callable",
     "below_noise": "even at the end of its plausible range it changes less than the noise shows",
 }

@@ -247,7 +247,7 @@ def _design(results: Results) -> Section:
             phase.name,
             *(phase.controller(arm) for arm in spec.of.agents),
             *(["may be on" if phase.beam else "off"] if beams else []),
-            conditions[phase.until].about if phase.until != "never" else "its time is out",
+            conditions[phase.until].about if phase.until != "never" else "its time has elapsed",
             f"{phase.timeout_s:g} s, then {phase.on_timeout}",
         )
         for phase in spec.phases

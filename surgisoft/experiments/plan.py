@@ -83,7 +83,7 @@ def settings(spec: Experiment, where: Where | None = None) -> list[Setting]:
         rig_config(setting, place, spec.of.agents)
     labels = [setting.label for setting in found]
     if twice := [label for label, number in Counter(labels).items() if number > 1]:
-        raise (place / "vary").error(f"'{min(twice)}' comes twice", "values that differ")
+        raise (place / "vary").error(f"'{min(twice)}' appears twice", "values that differ")
     return found
 
 

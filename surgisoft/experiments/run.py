@@ -95,7 +95,7 @@ def open_results(spec: Experiment, folder: Path, resume: bool = False, force: bo
         if load_experiment(folder / FILE) != spec:
             raise InputError(
                 f"{folder}: holds another experiment ({folder / FILE} differs); choose another "
-                "folder, or --force to begin anew"
+                "folder, or --force to start again"
             )
         _check_scene(spec, folder)
         return
@@ -106,8 +106,7 @@ def open_results(spec: Experiment, folder: Path, resume: bool = False, force: bo
             )
         if not force:
             raise InputError(
-                f"{folder}: results are already there; --resume continues them, "
-                "--force replaces them"
+                f"{folder}: results exist already; --resume continues them, --force replaces them"
             )
     check_playable(spec)
     about: dict[str, object] = {"versions": versions()}
@@ -128,7 +127,7 @@ def _check_scene(spec: Experiment, folder: Path) -> None:
     if spec.in_scene and began not in (None, scene_of(spec, settings(spec)[0]).content_hash):
         raise InputError(
             f"{folder}: its scene '{spec.scene}' has changed since the results began (by {file}); "
-            "bring that scene back, or --force to begin anew"
+            "bring that scene back, or --force to start again"
         )
 
 

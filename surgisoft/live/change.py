@@ -1,4 +1,4 @@
-"""Change detection: when has a model stopped holding?
+"""Change detection: since when is a model no longer valid?
 
 The residual (measured less predicted key points) of a good model is not white: camera noise is
 correlated over tenths of a second, and the model's own error is a function of where the arm is and
@@ -696,7 +696,7 @@ def alarms_in(steps: np.ndarray, h: float) -> int:
 
 @dataclass(frozen=True)
 class Alarm:
-    """The model has stopped holding."""
+    """The model is no longer valid."""
 
     at_s: float
     """Time of the sample after which the alarm was raised [s]."""
@@ -715,9 +715,9 @@ class Alarm:
     def sentence(self) -> str:
         """The alarm in words."""
         return (
-            f"the model stopped holding at {self.since_s:.1f} s, found at {self.at_s:.1f} s "
-            f"({self.at_s - self.since_s:.1f} s later): error {self.before_mm:.3f} mm in the "
-            f"reference, {self.after_mm:.3f} mm since"
+            f"the model has not been valid since {self.since_s:.1f} s; this was detected at "
+            f"{self.at_s:.1f} s ({self.at_s - self.since_s:.1f} s later): error "
+            f"{self.before_mm:.3f} mm in the reference, {self.after_mm:.3f} mm since"
         )
 
 

@@ -174,7 +174,7 @@ class RunResult:
     detector: Detector | None
     """The detector; None where the run was shorter than its reference."""
     alarms: tuple[Alarm, ...]
-    """When the model stopped holding."""
+    """When the model ceased to be valid."""
     judged: float
     """Share of the run behind the reference whose motion the reference covers; nan without one."""
     timing: Timing
@@ -357,7 +357,7 @@ class _Session:
                 pace = "real" if request.clock == "real" else "simulated"
             elif request.clock == "simulated":
                 raise InputError(
-                    f"--clock simulated: '{request.rig}' is no simulated rig; leave it out"
+                    f"--clock simulated: '{request.rig}' is not a simulated rig; leave it out"
                 )
             clock = Clock(rig.period_s, pace)
             note = f"run {Path(request.policy).name}"
@@ -531,8 +531,8 @@ class _Session:
         if not reads or abs(reads * rig.period_s * rate_hz - 1.0) > 1e-6:
             raise InputError(
                 f"rate is {rate_hz:g} Hz, and the rig '{self._rig_name}' gives "
-                f"{1.0 / rig.period_s:g} samples a second, expected a whole number of samples in a "
-                "period"
+                f"{1.0 / rig.period_s:g} samples per second, expected a whole number of samples in "
+                "a period"
             )
 
     def _protocol(self, rig: Rig) -> Protocol | None:
@@ -734,16 +734,16 @@ class _Session:
         if not detector.judges:
             self.on_warning(
                 f"the reference of {detector.reference_s:.0f} s does not repeat its motions: "
-                f"{detector.repeated:.0%} of it is like other parts of it, expected at least "
-                f"{LEAST_REPEATED:.0%}; no change is looked for. Give a longer one: --clean, or a "
-                "recording in the same kind of motion with --before"
+                f"{detector.repeated:.0%} of it resembles another part of it, expected at least "
+                f"{LEAST_REPEATED:.0%}, so no change can be detected. Give a longer reference "
+                "(--clean), or a recording of the same kind of motion (--before)"
             )
         rmse = self.model.validation.rmse_mm
         if rmse is not None and detector.reference_mm > SUSPICIOUS * rmse:
             self.on_warning(
                 f"the model's error in the reference is {detector.reference_mm:.3f} mm, its "
-                f"validated error {rmse:.3f} mm: the arm had changed before, or the model is that "
-                "of another arm; later changes are found, this one is not"
+                f"validated error {rmse:.3f} mm: the arm had changed already, or the model is that "
+                "of another arm; later changes are detected, this one is not"
             )
 
     # Ending ------------------------------------------------------------------------------------

@@ -88,7 +88,7 @@ class ParquetTable:
         for column, position in zip(self._read(positions), positions, strict=True):
             try:
                 if pa.types.is_boolean(column.type):
-                    raise pa.ArrowInvalid("true and false are no numbers")
+                    raise pa.ArrowInvalid("true and false are not numbers")
                 values = column.cast(pa.float64(), safe=False)
             except pa.ArrowException:
                 raise InputError(

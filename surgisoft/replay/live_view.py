@@ -221,7 +221,7 @@ def live_blueprint(bench: LiveBench, end_s: float | None = None) -> rrb.Blueprin
     actuation = "Pressure" if bench.unit == "kPa" else "Actuation"
     plots = [
         plot("residual", "Residual of each key point (mm)", "righttop"),
-        plot("alarm", "Alarm level; 1: the model stopped holding", None),
+        plot("alarm", "Alarm level (alarm at 1)", None),
         plot("pressure", f"{actuation} ({bench.unit}); darker: command", "righttop"),
     ]
     if bench.tracks:

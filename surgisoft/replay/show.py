@@ -48,7 +48,9 @@ def find_replay(path: str | Path) -> Path:
         with path.open("rb") as file:
             start = file.read(len(MAGIC))
         if start != MAGIC:
-            raise InputError(f"{path}: is no Rerun recording; expected one as 'replay' writes it")
+            raise InputError(
+                f"{path}: is not a Rerun recording; expected one as 'replay' writes it"
+            )
     return path
 
 

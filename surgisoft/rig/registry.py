@@ -55,7 +55,7 @@ def virtual(
     roll_deg: RollDeg = 0.0,
     payload_g: PayloadG = 0.0,
     noise: NoiseFactor = 1.0,
-    rate_Hz: Annotated[float, "samples a second"] = CameraDesign().rate_Hz,
+    rate_Hz: Annotated[float, "samples per second"] = CameraDesign().rate_Hz,
 ) -> Rig:
     """The project's own simulated bench: a quasi-static rod, syringe pumps, motion capture."""
     return VirtualRig(

@@ -94,8 +94,8 @@ class VirtualRigConfig:
         periods = 1.0 / (self.cameras.rate_Hz * self.pumps.step_s) if self.cameras.rate_Hz else 0.0
         if not (round(periods) >= 1 and abs(periods - round(periods)) < 1e-6):
             raise InputError(
-                f"cameras take {self.cameras.rate_Hz:g} frames a second, expected a period that is "
-                f"a multiple of the pumps' {self.pumps.step_s:g} s, such as 10, 20, 25 or 50"
+                f"cameras take {self.cameras.rate_Hz:g} frames per second, expected a period that "
+                f"is a multiple of the pumps' {self.pumps.step_s:g} s, such as 10, 20, 25 or 50"
             )
         first, last = self.event_window_s
         if not 0.0 <= first <= last < math.inf:

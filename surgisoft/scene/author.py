@@ -550,7 +550,7 @@ def check_target(folder: Path, force: bool) -> None:
     if not force:
         raise InputError(f"{folder}: exists already; choose another name or use --force")
     if not folder.is_dir() or (not (folder / FILE).exists() and any(folder.iterdir())):
-        raise InputError(f"{folder}: is no scene; --force replaces only a scene's folder")
+        raise InputError(f"{folder}: is not a scene; --force replaces only a scene's folder")
     if not os.access(folder, os.W_OK | os.X_OK):
         raise InputError(f"{folder}: cannot be written, it is not a writable folder")
 

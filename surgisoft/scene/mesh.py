@@ -147,7 +147,9 @@ class Body:
             raise InputError(f"body '{self.name}' has a pose of shape {pose.shape}: expected 4x4")
         turn = pose[:3, :3]
         if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-6 or np.linalg.det(turn) < 0:
-            raise InputError(f"body '{self.name}' has a pose that is no rotation: scale the mesh")
+            raise InputError(
+                f"body '{self.name}' has a pose that is not a rotation: scale the mesh"
+            )
         object.__setattr__(self, "pose", _frozen(pose))
 
     @cached_property

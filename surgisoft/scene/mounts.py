@@ -717,9 +717,10 @@ def _laser_shortfall(best: LaserSite, laser: LaserSpec, limits: LimitsSpec) -> s
         shown.append(
             f"smallest clearance {best.least_mm:.1f} mm, {limits.clearance_mm:g} mm required"
         )
+    why = ", ".join(shown) or "the arm would have to jump from one posture to another"
     return (
         f"no mount lets the laser cut the whole ring: the best covers "
-        f"{100 * best.good.mean():.0f} % ({', '.join(shown) or 'the arm would have to jump'})"
+        f"{100 * best.good.mean():.0f} % ({why})"
     )
 
 

@@ -275,7 +275,7 @@ def _drop_specks(vertices, faces, size, log):
         label[_pairs(faces)[0][:, 0] // 3], minlength=len(low)
     )
     keep = (high - low).max(axis=1) >= np.where(is_open, OPEN_SPECK, SPECK) * size
-    log["loose specks removed"] = int(np.sum(~keep))
+    log["small loose pieces removed"] = int(np.sum(~keep))
     used, dense = used_indices(faces[keep[label]])
     return vertices[used], dense
 
@@ -301,7 +301,7 @@ def _wind_alike(faces, what, log):
     fewer = kept_as_is[as_is] < kept_as_is[reversed_]
     equal = kept_as_is[as_is] == kept_as_is[reversed_]
     turned = fewer | (equal & (as_is > reversed_))
-    log["faces wound alike"] = int(turned.sum())
+    log["faces reoriented"] = int(turned.sum())
     return np.where(turned[:, None], faces[:, ::-1], faces)
 
 
@@ -380,7 +380,7 @@ def _outward(vertices, faces, hole_mm, log) -> list[_Shell]:
             mesh = Mesh(mesh.vertices_mm, mesh.faces[:, ::-1])
             turned += 1
         shells.append(_Shell(mesh, hole_mm[own]))
-    log["inside-out bodies turned"] = turned
+    log["inside-out bodies flipped"] = turned
     return shells
 
 

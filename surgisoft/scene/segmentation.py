@@ -232,7 +232,7 @@ def _labels(data: np.ndarray, path: Path) -> np.ndarray:
         return data
     whole = np.rint(data)
     if not np.isfinite(data).all() or not np.array_equal(whole, data):
-        raise InputError(f"{path}: holds grey values; expected whole numbers, a label for a voxel")
+        raise InputError(f"{path}: holds grey values; expected whole numbers, one label per voxel")
     return whole.astype(np.int32)
 
 

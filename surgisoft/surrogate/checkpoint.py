@@ -72,8 +72,8 @@ it is now: effects that were fitted around another callable do not belong to thi
 def _network_config(network) -> dict:
     if isinstance(network, PredictedNetwork):
         raise InputError(
-            f"{network.name}: predictions of recorded rows are no model that could be saved; give "
-            "the model as a callable (docs/your_model.md)"
+            f"{network.name}: predictions of recorded rows are not a model that could be saved; "
+            "give the model as a callable (docs/your_model.md)"
         )
     if isinstance(network, CallableNetwork) and not network.named.found:
         raise InputError(
@@ -118,7 +118,7 @@ def claim_folder(folder: str | Path, force: bool = False) -> Path:
     if not above.is_dir() or not os.access(above, os.W_OK):
         raise InputError(f"{folder}: cannot be written, {above} is not a writable folder")
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not force):
-        raise InputError(f"{folder}: already there; choose another name or pass --force")
+        raise InputError(f"{folder}: already exists; choose another name or pass --force")
     if folder.is_dir() and any(folder.iterdir()) and not (folder / "config.json").is_file():
         raise InputError(f"{folder}: holds files that are not a model; choose another name")
     return folder

@@ -175,7 +175,7 @@ def export_arm(
     """
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: already there; choose another name")
+        raise InputError(f"{folder}: already exists; choose another name")
     try:
         graph = ArmGraph(model)
         for name, effect in graph.model.effects.items():

@@ -93,7 +93,7 @@ def test_other_programs_get_the_same_actions(policy, exported):
     about = json.loads((exported / "policy.json").read_text())
     assert about["task"] == "track_circle"
     assert about["agents"]["arm"]["observation"] == seen.shape[1]
-    with pytest.raises(InputError, match="already there"):
+    with pytest.raises(InputError, match="already exists"):
         export(policy, exported)
 
 

@@ -90,8 +90,8 @@ def test_a_run_is_not_written_over_anything(tmp_path):
     (tmp_path / "file").write_text("x")
     for folder, message in (
         (tmp_path / "file" / "run", "file is not a writable folder"),
-        (tmp_path / "file", "already there; choose another name"),
-        (tmp_path, "already there; choose another name"),
+        (tmp_path / "file", "already exists; choose another name"),
+        (tmp_path, "already exists; choose another name"),
     ):
         with pytest.raises(InputError, match=message):
             check_free(folder)
@@ -109,7 +109,7 @@ def test_several_processes_need_a_named_folder(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="unknown logger 'x'"):
         train("track_circle", "full", steps=100, logger="x")
     monkeypatch.setenv("RANK", "0")
-    with pytest.raises(InputError, match="already there"):
+    with pytest.raises(InputError, match="already exists"):
         train("track_circle", "full", steps=100, logger="x")
     assert [path.name for path in tmp_path.iterdir()] == ["full"]
 
@@ -231,7 +231,7 @@ def test_tasks_and_rigs_that_do_not_fit_are_one_line(packaged, tmp_path):
     with pytest.raises(InputError, match="observes its scene and does not state what a controller"):
         ControllerGraph(Silent(), {})
     (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="already there; choose another name"):
+    with pytest.raises(InputError, match="already exists; choose another name"):
         export(None, tmp_path)
 
 

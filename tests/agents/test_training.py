@@ -293,7 +293,7 @@ def test_paper_preset_is_the_papers():
 
 
 def test_bad_folders_and_policies_are_refused(run, ablation, tmp_path):
-    with pytest.raises(InputError, match="already there"):
+    with pytest.raises(InputError, match="already exists"):
         train_new(run.path, plan_of(), Processes(), CPU)
     with pytest.raises(InputError, match="no training run"):
         RunFolder(tmp_path)

@@ -70,7 +70,7 @@ def test_a_folder_holds_config_weights_and_report(lab):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["fit", "{lab}/walk.parquet", "-o", "{lab}/arm"], "already there"),
+        (["fit", "{lab}/walk.parquet", "-o", "{lab}/arm"], "already exists"),
         (["fit", "{lab}/nothing.parquet", "-o", "{lab}/new"], "nothing.parquet"),
         (["fit", "{lab}/walk.parquet", "-o", "{lab}/new", "--effects", "ghost"], "known are"),
         (["fit", "{lab}/walk.parquet", "-o", "{lab}/new", "--widths", "a,b"], "whole numbers"),

@@ -341,9 +341,9 @@ def test_demo_and_replay_print_where_things_are(tmp_path, capsys, monkeypatch):
     for no_picture in ("", "no browser"):
         assert run(["demo", "-o", str(tmp_path)]) == 0
         out = capsys.readouterr().out
-        assert out.startswith(f"1. cut: done\n   its picture: {tmp_path / 'index.html'}, which")
+        assert out.startswith(f"1. cut: done\n   see {tmp_path / 'index.html'}; each further step")
         assert "2. diagnose: done\n" in out
-        assert out.count("its picture") == 1
+        assert out.count("   see ") == 1
         assert ("no picture of the replay: no browser\n" in out) == bool(no_picture)
     target = "surgisoft.replay.show.open_replay"
     out = printed(capsys, monkeypatch, target, "wrote a.rrd", "replay", "a.npz")

@@ -38,7 +38,16 @@ def test_an_end_on_another_day_has_its_date():
     pace = Pace(clock, noon)
     pace(0, 24)
     clock.now = 3600.0
-    assert pace(1, 24) == "0.069 %/min, 1380 min left, ends 2026-11-23 11:00"
+    assert pace(1, 24) == "0.069 %/min, 23 h left, ends 2026-11-23 11:00"
+
+
+def test_no_end_is_extrapolated_from_less_than_a_hundredth():
+    clock = Clock()
+    pace = Pace(clock, noon)
+    pace(50, 1000)
+    clock.now = 100.0
+    assert pace(59.9, 1000) == ""
+    assert pace(60, 1000) == "0.6 %/min, 3 h left, ends 14:36"
 
 
 def test_work_that_goes_on_is_not_counted_as_done_in_no_time():

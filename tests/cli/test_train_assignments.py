@@ -76,7 +76,7 @@ def test_a_training_with_assignments_and_a_service(tmp_path, monkeypatch, capsys
     assert ended == [True]
     assert service.run.name == "run", "not after the folder of TensorBoard's files"
     assert [*(folder / "tensorboard").glob("events*")]
-    assert "did not come far" in printed.err
+    assert "did not converge" in printed.err
 
 
 @pytest.mark.parametrize(

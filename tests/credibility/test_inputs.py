@@ -123,7 +123,7 @@ def test_the_tip_has_a_limit_of_its_own():
 
 def test_what_a_context_says_of_no_recording_is_refused():
     stated = context(sources=(Source("other"),))
-    with pytest.raises(InputError, match=r"'other' is no recording of this comparison, .* rec"):
+    with pytest.raises(InputError, match=r"'other' is not a recording of this comparison, .* rec"):
         assess(stated, None, SimpleNamespace(model=None), [recording()])
 
 

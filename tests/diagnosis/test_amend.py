@@ -123,7 +123,7 @@ def test_an_amended_model_is_a_model(lab, capsys):
         assert torch.allclose(points[0], predicted[row], atol=1e-3)
     assert compare(model, [recording])[0].rmse_mm < 1.1 * error["floor"]
     assert run([*command, "-o", str(new)]) == 2
-    assert "already there" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err
 
 
 def test_a_clean_recording_is_refused(lab, capsys):

@@ -429,15 +429,15 @@ def test_a_damaged_asset_is_refused_in_one_line(tmp_path, change, told):
     [
         (
             lambda v: v["models"]["missing"].update(constant="1"),
-            "a weight that is no finite number",
+            "a weight that is not a finite number",
         ),
         (
             lambda v: v["calibration"].update(other={"constant": 0.0, "slope": 1.0}),
             "'other' is not",
         ),
-        (lambda v: v.update(wrong_unknown=None), "wrong_unknown is no finite number"),
-        (lambda v: v.update(wrong_unknown=10**400), "wrong_unknown is no finite number"),
-        (lambda v: v.update(calibration="name"), "calibration is no table"),
+        (lambda v: v.update(wrong_unknown=None), "wrong_unknown is not a finite number"),
+        (lambda v: v.update(wrong_unknown=10**400), "wrong_unknown is not a finite number"),
+        (lambda v: v.update(calibration="name"), "calibration is not a table"),
     ],
 )
 def test_an_asset_with_its_hash_but_no_numbers_is_refused(tmp_path, change, told):

@@ -191,9 +191,9 @@ def test_a_damaged_decision_is_one_line(tmp_path):
     for changes, message in (
         ({"schema": True}, "a fitted decision of schema True, expected"),
         (model(weights={}), f"model '{name}' has the features , expected"),
-        (model(weights=weights | {first: None}), "has a weight that is no finite number"),
-        (model(constant="x"), "has a weight that is no finite number"),
-        ({"calibration": []}, "calibration is no table; fit it again"),
+        (model(weights=weights | {first: None}), "has a weight that is not a finite number"),
+        (model(constant="x"), "has a weight that is not a finite number"),
+        ({"calibration": []}, "calibration is not a table; fit it again"),
         ({"calibration": {"ghost": {"constant": 0.0, "slope": 1.0}}}, "calibration 'ghost' is not"),
     ):
         values = good | changes

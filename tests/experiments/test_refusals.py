@@ -38,7 +38,7 @@ def spec_of(folder, text: str = TINY):
 @pytest.mark.parametrize(
     ("field", "values", "message"),
     [
-        ("task.fire_mm", "1.0, 1.0", "'simulation_fire_mm=1' comes twice; expected values that"),
+        ("task.fire_mm", "1.0, 1.0", "'simulation_fire_mm=1' appears twice; expected values that"),
         ("hidden.creep", "-1.0", "got -1.0; expected amplitudes from 0"),
         ("hidden.creep", '"much"', "got 'much'; expected amplitudes from 0"),
         ("fault.chamber", "0", "got 0; expected what a fault has as chamber"),
@@ -180,7 +180,7 @@ def test_results_go_on_only_with_their_own_scene(tmp_path):
     spec, folder = spec_of(tmp_path), tmp_path / "results"
     open_results(spec, folder)
     open_results(spec, folder, resume=True)
-    with pytest.raises(InputError, match="results are already there; --resume continues them"):
+    with pytest.raises(InputError, match="results exist already; --resume continues them"):
         open_results(spec, folder)
     with pytest.raises(InputError, match="holds another experiment"):
         open_results(replace(spec, repeats=spec.repeats + 1), folder, resume=True)

@@ -192,7 +192,7 @@ def test_heavy_tails_of_the_reference_enlarge_the_scale():
 
 def jumps(seconds, seed, factor):
     """A slow circle with a jump each 20 s, and an error with 0.4 half ranges of memory along the
-    path, whose innovations are `factor` times as large in the jumps; four samples a second."""
+    path, whose innovations are `factor` times as large in the jumps; four samples per second."""
     rng = np.random.default_rng(seed)
     t_s = np.arange(round(4.0 * seconds)) / 4.0
     jumping = t_s % 20.0 >= 19.0

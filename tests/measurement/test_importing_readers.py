@@ -144,7 +144,9 @@ def test_a_known_format_that_no_reader_reads_is_named(tmp_path, ending, kind):
     assert f"expected one of auto, {', '.join(READERS)}; export it as CSV" in str(error.value)
     path = tmp_path / f"raw.{ending}"
     path.write_bytes(b"\1\0\2\0" * 100)
-    with pytest.raises(InputError, match=rf"raw.{ending}: an? .*{kind}.*which no reader reads"):
+    with pytest.raises(
+        InputError, match=rf"raw.{ending}: an? .*{kind}.*for which there is no reader"
+    ):
         import_files([path], load_map(write_map(tmp_path, "auto")), "r")
 
 

@@ -183,7 +183,7 @@ def test_uneven_times_are_put_on_the_grid(tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda r: replace(r, t_s=r.t_s * 0.7), "28.57 samples a second"),
+        (lambda r: replace(r, t_s=r.t_s * 0.7), "28.57 samples per second"),
         (lambda r: replace(r, kind="settled"), "steady-state samples"),
     ],
 )
@@ -195,7 +195,7 @@ def test_recordings_without_a_whole_rate_are_refused(tmp_path, change, words):
 
 def test_folder_with_content_is_refused(tmp_path):
     (tmp_path / "note.txt").write_text("mine")
-    with pytest.raises(InputError, match="is there already"):
+    with pytest.raises(InputError, match="exists already"):
         save_lerobot([recording()], tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["note.txt"]
 

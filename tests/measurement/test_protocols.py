@@ -203,7 +203,7 @@ def test_schedule_file(tmp_path):
         ("t_s,c1_kPa,c2_psi\n0,1,1\n1,2,2\n", "commands in kPa, psi, expected one unit"),
         ("t_s,c1_kPa,c3_kPa\n0,1,1\n1,2,2\n", "expected t_s, c1_kPa ... cm_kPa"),
         ("time,c1_kPa\n0,1\n1,2\n", "unknown column 'time'"),
-        ("t_s,c1_kPa,run\n0,1,0\n1,1,1\n2,1,0\n", "a run comes back after another"),
+        ("t_s,c1_kPa,run\n0,1,0\n1,1,1\n2,1,0\n", "a run appears again after another run"),
         ("t_s,c1_kPa,run\n0,1,0\n1,1,0.5\n", "run has a value that is not a whole number"),
     ],
 )

@@ -127,7 +127,7 @@ def test_gravity_within_tolerance_gets_unit_length():
     ("changes", "message"),
     [
         ({"t_s": [0, 1, 2, 2, 3, 4.0]}, "time of sample 3 is 2.0 s after 2.0 s"),
-        ({"run": [0, 0, 1, 1, 0, 0]}, "run 0 comes back at sample 4"),
+        ({"run": [0, 0, 1, 1, 0, 0]}, "run 0 appears again at sample 4"),
         ({"measured": np.full((6, 2), np.nan)}, "measured of sample 0 is not finite"),
         ({"measured": np.ones((5, 2))}, "measured has shape (5, 2), expected (6, 2)"),
         ({"commanded": np.ones((6, 1))}, "commanded has shape (6, 1), expected (6, 2)"),

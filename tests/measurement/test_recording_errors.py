@@ -68,7 +68,7 @@ ROWS = [
 RUNS = [
     ("0,1,2,3,4,0\n1,1,2,3,4,0.5\n", "line 3, column 'run': got 0.5, expected an integer"),
     ("0,1,2,3,4,0\n1,1,2,3,4,\n", "line 3, column 'run': got a missing value"),
-    ("0,1,2,3,4,0\n1,1,2,3,4,1\n2,1,2,3,4,0\n", "line 4, column 'run': run 0 comes back after"),
+    ("0,1,2,3,4,0\n1,1,2,3,4,1\n2,1,2,3,4,0\n", "line 4, column 'run': run 0 appears again after"),
     ("0,1,2,3,4,0\n0,1,2,3,4,1\n0,1,2,3,4,1\n", "line 4, column 't_s': 0.0 s after 0.0 s"),
 ]
 

@@ -60,14 +60,14 @@ def test_a_torn_log_opens_and_says_what_is_missing(tmp_path, capsys):
     lines = text.splitlines(keepends=True)
     log.write_bytes(b"".join(lines[:10]) + lines[10][:25])
     read, lacking = read_log(log)
-    assert lacking == "its last line is torn and left out"
+    assert lacking == "its last line is incomplete and was left out"
     assert read.samples == 3
     np.testing.assert_allclose(read.measured[:2], whole.measured[:2])
     log.write_bytes(b"".join(lines[:6]) + b'{"row":1,"p":[\n')
-    assert "its last line is torn and left out" in read_log(log)[1]
+    assert "its last line is incomplete and was left out" in read_log(log)[1]
     log.write_bytes(b"".join(lines[:6]) + b"\0" * 40)
     assert read_log(log)[1] == (
-        "it was interrupted after 2 of 3 samples; its last line is torn and left out"
+        "it was interrupted after 2 of 3 samples; its last line is incomplete and was left out"
     )
     out = tmp_path / "r.parquet"
     assert run(["import", str(log), "-o", str(out)]) == 0

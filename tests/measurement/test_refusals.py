@@ -59,7 +59,10 @@ def recording(rows: int = 8, **more) -> Recording:
         ({"commands": np.zeros(3)}, "commands (3,) and runs (3,), expected (T, m) and (T,)"),
         ({"run": np.zeros(2)}, "commands (3, 2) and runs (2,), expected (T, m) and (T,)"),
         ({"commands": np.array([[1, 1], [1, math.nan], [1, 1]])}, "the command of row 2 is not f"),
-        ({"run": np.array([0, 1, 0])}, "a run comes back after another; keep its rows together"),
+        (
+            {"run": np.array([0, 1, 0])},
+            "a run appears again after another run; keep its rows together",
+        ),
         ({"kind": "settled", "average_s": 0.0}, "settle_s 3.0 and average_s 0.0, expected >= 0"),
         ({"t_s": None}, "a continuous protocol needs a time for every row"),
         ({"t_s": np.zeros(3)}, "time does not increase at row 2; each run needs rising times"),
@@ -349,7 +352,7 @@ def test_datasets_that_cannot_be_written(tmp_path):
         ([one], 0, "fps is 0, expected at least 1"),
         ([one, other], None, "recording 'other': other columns than recording 'rec'; expected the"),
         ([single], None, "no run has two samples, expected some"),
-        ([apart], 10, "no run of two frames at 10 frames a second"),
+        ([apart], 10, "no run of two frames at 10 frames per second"),
     ):
         assert message in refusal(
             lambda given=given, fps=fps: save_lerobot(given, tmp_path / "s", fps=fps)

@@ -60,7 +60,7 @@ def test_effects_that_begin_later_are_checked():
         VirtualRig(0, hidden=[("payload", 1.0, -1.0)])
     with pytest.raises(InputError, match="given twice"):
         VirtualRig(0, hidden=[("payload", 1.0), ("payload", 1.0, 5.0)])
-    with pytest.raises(InputError, match="15 frames a second, expected a period that is a"):
+    with pytest.raises(InputError, match="15 frames per second, expected a period that is a"):
         VirtualRig(0, cameras=CameraDesign(rate_Hz=15.0))
 
 

@@ -402,7 +402,7 @@ def test_an_existing_folder_is_kept(made, tmp_path, capsys):
     (tmp_path / "papers").mkdir()
     (tmp_path / "papers" / "thesis.txt").write_text("years of work")
     assert new(tmp_path / "papers", tmp_path / "ball.ply", "--force") == 2
-    assert "is no scene" in capsys.readouterr().err
+    assert "is not a scene" in capsys.readouterr().err
     assert (tmp_path / "papers" / "thesis.txt").exists()
 
 

@@ -185,8 +185,8 @@ def test_targets_that_are_no_scene_are_kept(tmp_path):
     (tmp_path / "folder" / "note.txt").write_text("x")
     (tmp_path / "empty").mkdir()
     for place, message in (
-        (tmp_path / "file", "is no scene; --force replaces only a scene's folder"),
-        (tmp_path / "folder", "is no scene; --force replaces only a scene's folder"),
+        (tmp_path / "file", "is not a scene; --force replaces only a scene's folder"),
+        (tmp_path / "folder", "is not a scene; --force replaces only a scene's folder"),
         (tmp_path / "file" / "new", "cannot be written"),
     ):
         assert message in refusal(lambda p=place: check_target(p, force=True))

@@ -52,13 +52,13 @@ def test_random_damage_that_loses_nothing_is_undone(seed, share):
     assert body.volume_mm3 == pytest.approx(mesh.volume_mm3, rel=1e-5)
     done = counts(repaired)
     assert done["duplicate vertices joined"] == len(soup) - len(mesh.vertices_mm)
-    assert done["faces wound alike"] == min(turned.sum(), len(faces) - turned.sum())
+    assert done["faces reoriented"] == min(turned.sum(), len(faces) - turned.sum())
 
 
 def test_an_inside_out_body_is_turned():
     repaired = repair(BALL.vertices_mm, BALL.faces[:, ::-1], "ball")
     assert repaired.bodies[0].volume_mm3 == pytest.approx(BALL.volume_mm3)
-    assert counts(repaired) == {"inside-out bodies turned": 1}
+    assert counts(repaired) == {"inside-out bodies flipped": 1}
 
 
 def test_degenerate_and_double_faces_go():
@@ -110,7 +110,7 @@ def test_loose_specks_go():
     speck = type(BALL)(BALL.vertices_mm * 1e-3 + 80.0, BALL.faces)
     repaired = repair(*joined(BALL, speck), "ball")
     assert len(repaired.bodies) == 1
-    assert counts(repaired) == {"loose specks removed": 1}
+    assert counts(repaired) == {"small loose pieces removed": 1}
 
 
 def moebius():

@@ -217,5 +217,5 @@ def test_the_command_refuses_what_belongs_to_runs(tmp_path, capsys):
     (tmp_path / "x").mkdir()
     (tmp_path / "x" / "mine.txt").write_text("mine")
     assert surgisoft(["export", "default", "-o", str(tmp_path / "x")]) == 2
-    assert "already there" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err
     assert [file.name for file in (tmp_path / "x").iterdir()] == ["mine.txt"]

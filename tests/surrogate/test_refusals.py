@@ -92,7 +92,7 @@ def test_what_a_callable_states_becomes_the_model():
     assert arm_by_itself(given_callable(Arm(**RANGE))).validation.rmse_mm is None
     with pytest.raises(InputError, match="does not state its range of actuation, which recordings"):
         arm_by_itself(given_callable(Arm()))
-    with pytest.raises(InputError, match="lab: 3 validated errors, expected one or 2, one a key"):
+    with pytest.raises(InputError, match="lab: 3 validated errors, expected one or 2, one per key"):
         validation_of([0.1, 0.2, 0.3], 2, "lab")
 
 
@@ -153,10 +153,10 @@ def predictions() -> ArmModel:
     return predicted_arm("lab", [some])
 
 
-def test_predictions_are_no_model_that_could_be_saved(tmp_path):
+def test_predictions_are_not_a_model_that_could_be_saved(tmp_path):
     arm = predictions()
     assert arm.summary().startswith("predictions of lab (pressure), 2 chambers in kPa")
-    with pytest.raises(InputError, match="lab: predictions of recorded rows are no model that"):
+    with pytest.raises(InputError, match="lab: predictions of recorded rows are not a model that"):
         save_model(arm, tmp_path / "arm")
     assert not (tmp_path / "arm").exists()
     planned = pack([torch.arange(3.0)], [torch.ones(3, 2)], [torch.zeros(3, 2, 3)])

@@ -225,7 +225,7 @@ def test_events_by_hand():
         (5.0, "info", "1 mm clear again"),
         (5.0, "error", "ended early"),
     ]
-    assert find_events(log, "time out")[-1].text == "the time is out"
+    assert find_events(log, "time out")[-1].text == "the time has elapsed"
     assert find_events(log, "failed")[-1].level == "error"
 
 

@@ -150,7 +150,7 @@ def test_an_archive_that_unpacks_to_gigabytes_is_refused(members, tmp_path):
 @pytest.mark.parametrize(
     ("path", "value", "said"),
     [
-        (("log", "table", "rewards"), "x", "its rewards are no table"),
+        (("log", "table", "rewards"), "x", "its rewards are not a table"),
         (("log", "table", "agents"), ["nobody"], "its agents are none of its arms"),
         (("log", "table", "dose", "table", "body"), "spleen", "a body that is not in it"),
         (("log", "table", "limits", "table"), {}, "a view without its limit"),
@@ -160,7 +160,7 @@ def test_an_archive_that_unpacks_to_gigabytes_is_refused(members, tmp_path):
             "range is impossible",
         ),
         (("log", "table", "arms", "table", "laser", "table", "tool"), "knife", "unknown tool"),
-        (("log", "table", "dt_s"), 10**400, "'dt_s' of the log is no number"),
+        (("log", "table", "dt_s"), 10**400, "'dt_s' of the log is not a number"),
         (("format",), "\x1b[2J", r"format text '\\x1b\[2J', expected"),
     ],
 )
@@ -218,7 +218,7 @@ CONTRADICTIONS = {
         log, **dict.fromkeys(("points_mm", "seen_mm"), np.zeros((len(log.time_s), 0, 3)))
     ),
     "a radius or a shaft of an impossible size": lambda log: with_arm(log, radius_mm=0.0),
-    "its limits are no numbers": lambda log: replace(log, limits={"clearance_mm": "1"}),
+    "its limits are not numbers": lambda log: replace(log, limits={"clearance_mm": "1"}),
     "it has a beam without the arm 'x'": lambda log: replace(
         log, beams={"x": next(iter(log.beams.values()))}
     ),
@@ -228,13 +228,13 @@ CONTRADICTIONS = {
     "an event of an unknown level 'x'": lambda log: replace(
         log, events=(parts.Event(0.0, "x", "text"),)
     ),
-    "'path_mm' of the log is no array": lambda log: replace(log, path_mm=[[0.0, 0.0, 0.0]]),
+    "'path_mm' of the log is not an array": lambda log: replace(log, path_mm=[[0.0, 0.0, 0.0]]),
     "holds infinite numbers": lambda log: with_first(
         log, "beams", power_w=np.full(len(log.time_s), np.inf)
     ),
-    "'driver' of the log is no text": lambda log: replace(log, driver=1),
-    "'seed' of the log is no integer": lambda log: replace(log, seed=1.5),
-    "the camera's range is no pair of numbers": lambda log: with_first(
+    "'driver' of the log is not a text": lambda log: replace(log, driver=1),
+    "'seed' of the log is not an integer": lambda log: replace(log, seed=1.5),
+    "the camera's range is not a pair of numbers": lambda log: with_first(
         log, "cameras", range_mm=(1.0,)
     ),
     "has an unknown role 'x'": lambda log: with_body(log, role="x"),
@@ -243,8 +243,8 @@ CONTRADICTIONS = {
     "on a face of a negative number": lambda log: with_dose(log, faces=-1 - log.dose.faces),
     "a limit that is not above 0": lambda log: with_dose(log, cut_j_per_mm2=0.0),
     "lack the one of the clearance": lambda log: replace(log, limits={"time_s": 1.0}),
-    "its rewards are no table": lambda log: replace(log, rewards=[1.0]),
-    "is no number for each of": lambda log: replace(log, measures={"a": np.zeros(1)}),
+    "its rewards are not a table": lambda log: replace(log, rewards=[1.0]),
+    "is not a number for each of": lambda log: replace(log, measures={"a": np.zeros(1)}),
 }
 
 

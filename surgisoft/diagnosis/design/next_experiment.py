@@ -607,7 +607,7 @@ class Recommendation:
         """One sentence."""
         worst = min(self.pairs, key=lambda pair: pair.before)
         a, b = worst.effects
-        many = f"; {len(self.separates)} of {len(self.pairs)} pairs are told apart by it"
+        many = f"; {len(self.separates)} of {len(self.pairs)} pairs are distinguished by it"
         return (
             f"the chance to tell {a} from {b} goes from {worst.before:.2f} to {worst.after:.2f}"
             + (many if len(self.pairs) > 1 else "")

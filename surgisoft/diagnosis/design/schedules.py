@@ -107,7 +107,7 @@ _EVERY_SETUP = (
     Setup("no_support", "move everything away that the arm's body may lean on", 1.0),
     Setup(
         "bare_tip",
-        "take everything off the tip and the body that is no part of the arm",
+        "take everything off the tip and the body that is not part of the arm",
         2.0,
     ),
     Setup(

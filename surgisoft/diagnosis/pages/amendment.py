@@ -337,7 +337,7 @@ def _why_not(name: str, first: Diagnosis) -> str:
 def _worth(result: Improvement) -> str:
     fall = result.held_out
     if not result.steps:
-        return "Nothing was added, so the error is what it was."
+        return "No effect was added, so the error is unchanged."
     room = fall.before**2 - fall.floor**2
     share = (fall.before**2 - fall.after**2) / room if room > 0 else float("nan")
     times = fall.after / fall.floor if fall.floor > 0 else float("nan")
@@ -359,7 +359,7 @@ def _left(result: Improvement) -> Section:
         names = ", ".join(f"{each.name} of {each.effect}" for each in wrong)
         text = (
             f"Outside its plausible range, so not known from these recordings: {names}. The error "
-            "falls with it, but its value is no measurement."
+            "falls with it, but its value is not a measurement."
         )
         parts.append(Text(text))
     if last.next_experiment:

@@ -46,7 +46,7 @@ LEAST_SURE = 0.5
 
 
 HOW_CHANGE = (
-    "Change: measured after less measured before at the instant with the same actuation, a small "
+    "Change: measured after minus measured before at the instant with the same actuation, a small "
     "difference of the actuation corrected by the model. The model's own error is in neither "
     "curve. What an effect explains is to first order; `surgisoft amend --before` fits it."
 )
@@ -249,9 +249,9 @@ def _probabilities(chances: Probabilities) -> Section:
     """What may be true, with the calibrated probabilities."""
     rows = [
         ("nothing is missing", f"{chances.nothing:.2f}"),
-        ("nothing but a better network", f"{chances.network:.2f}"),
-        ("an effect of the list", f"{chances.known:.2f}"),
-        ("something outside the list", f"{chances.unknown:.2f}"),
+        ("only the network needs a better fit", f"{chances.network:.2f}"),
+        ("a known effect is missing", f"{chances.known:.2f}"),
+        ("an unknown effect is missing", f"{chances.unknown:.2f}"),
     ]
     if chances.two:
         rows.append((f"both {' and '.join(chances.two)}", f"{chances.pair:.2f}"))

@@ -292,7 +292,7 @@ class _Report:
         if self.blind:
             again = f"record again with a sensor that reads channel {self.blind.channel + 1}"
         elif still:
-            again = f"look after chamber {still[0] + 1} (valve, line, leak) and record again"
+            again = f"check chamber {still[0] + 1} (valve, line, leak) and record again"
         if not again:
             return lines, True
         other = [table for table in correction.tables(False) if table != "measured"]
@@ -341,9 +341,9 @@ def _frozen_chamber(k: int, share: float) -> SetupFault:
 
 
 TESTS = {
-    "chambers": "pressurise one chamber alone and look which one fills",
-    "frame": "move a marker along one axis of the cameras and look which column changes",
-    "key_points": "cover the tip's marker and look which key point is lost",
+    "chambers": "pressurise one chamber alone and see which one fills",
+    "frame": "move a marker along one axis of the cameras and see which column changes",
+    "key_points": "cover the tip's marker and see which key point is lost",
     "length_unit": "compare a distance with a ruler",
     "actuation_unit": "compare a reading with a gauge",
     "time": "tap the arm and compare the clocks",
@@ -356,4 +356,4 @@ def _how_to_tell(faults: Sequence[SetupFault], alternatives) -> str:
     if not alternatives:
         return ""
     kinds = {fault.kind for some in (faults, *alternatives) for fault in some}
-    return "to tell: " + "; or ".join(TESTS[kind] for kind in TESTS if kind in kinds)
+    return "to distinguish them: " + "; or ".join(TESTS[kind] for kind in TESTS if kind in kinds)

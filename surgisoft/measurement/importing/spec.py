@@ -69,7 +69,7 @@ Unit = Annotated[
 ]
 PerChannel = Annotated[
     float | tuple[float, ...],
-    Rule("a number or a number a channel", lambda value: value != ()),
+    Rule("one number, or one per channel", lambda value: value != ()),
 ]
 PERMUTATION = Rule(
     "each of the numbers 0, 1, ... once", lambda order: sorted(order) == [*range(len(order))]
@@ -133,7 +133,7 @@ class ActuationMap:
             value = getattr(self, name)
             if self.columns and isinstance(value, tuple) and len(value) not in (1, self.channels):
                 raise (where / name).error(
-                    f"got {describe([*value])}", f"one number, or {self.channels}, one a channel"
+                    f"got {describe([*value])}", f"one number, or {self.channels}, one per channel"
                 )
         return self
 
@@ -408,7 +408,7 @@ def _check_format(name: str, where: Where) -> None:
     known = formats()
     if name not in known:
         kind = NOT_READ.get(name.lower())
-        came = f"got {describe(name)}" + (f", {kind}, which no reader reads" if kind else "")
+        came = f"got {describe(name)}" + (f", {kind}, for which there is no reader" if kind else "")
         expected = f"one of {', '.join(known)}" + (f"; {ADVICE}" if kind else "")
         raise where.error(came, expected)
 

@@ -44,7 +44,7 @@ class Protocol:
             self._fail(f"the command of row {row + 1} is not finite")
         starts = self.run[np.flatnonzero(np.diff(self.run, prepend=self.run[0] - 1))]
         if len(set(starts.tolist())) != len(starts):
-            self._fail("a run comes back after another; keep its rows together")
+            self._fail("a run appears again after another run; keep its rows together")
         if self.kind == "continuous":
             self._check_times()
         elif not (self.settle_s >= 0 and self.average_s > 0):

@@ -255,7 +255,7 @@ def _check_order(table: Table, t_s: np.ndarray, run: np.ndarray, rows: np.ndarra
     again = first_run_again(run)
     if again is not None:
         raise InputError(
-            f"{table.place(int(rows[again]))}, column 'run': run {run[again]} comes back "
+            f"{table.place(int(rows[again]))}, column 'run': run {run[again]} appears again "
             "after another run, expected the rows of a run in one block"
         )
     back = first_time_backwards(t_s, run)

@@ -4,8 +4,8 @@ A run is an episode. `observation.state` holds measured actuation and key points
 commanded actuation, each under the names of a recording's columns (`p1_kPa`, `k0_x_mm`, `c1_kPa`),
 so that a dataset that `lerobot-record` wrote with the robot of `surgisoft.rig.lerobot` opens here,
 too. The action of a frame is what is commanded *after* its observation, hence the command of the
-recording's next row. Frames stand on a grid of an integer number of frames a second, as the format
-requires.
+recording's next row. Frames stand on a grid of an integer number of frames per second, as the
+format requires.
 
 Source: the format as LeRobot 0.4.4 writes and reads it (`codebase_version` "v3.0").
 """
@@ -56,7 +56,7 @@ tolerance of timestamps)."""
 LONGEST_STEP = 2.5
 """Steps of more than this many frames are gaps: an episode ends there."""
 WHOLE_RATE = 0.005
-"""Share by which a rate may be off an integer number of frames a second."""
+"""Share by which a rate may be off an integer number of frames per second."""
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 """Quantiles in a dataset's statistics (q01 ... q99)."""
 _INDICES = ("timestamp", "frame_index", "episode_index", "index", "task_index")
@@ -102,7 +102,7 @@ def save_lerobot(
     """
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: is there already, expected a new folder")
+        raise InputError(f"{folder}: exists already, expected a new folder")
     if fps is not None and fps < 1:
         raise InputError(f"fps is {fps}, expected at least 1")
     first = recordings[0]
@@ -122,7 +122,7 @@ def save_lerobot(
     notes: list[str] = []
     episodes = [e for recording in recordings for e in _episodes(recording, rate, notes)]
     if not episodes:
-        raise InputError(f"{first.label}: no run of two frames at {rate} frames a second")
+        raise InputError(f"{first.label}: no run of two frames at {rate} frames per second")
     lost = sum(int(np.isnan(e.state).any(axis=1).sum()) for e in episodes)
     if lost:
         total = sum(len(e.state) for e in episodes)
@@ -153,14 +153,14 @@ def _rate(recordings: Sequence[Recording]) -> int:
     rate = 1 / float(np.median(steps))
     if round(rate) < 1 or abs(rate / round(rate) - 1) > WHOLE_RATE:
         raise InputError(
-            f"{recordings[0].label}: {rate:.4g} samples a second, and a LeRobotDataset has an "
-            "integer number of frames a second; state it with --fps"
+            f"{recordings[0].label}: {rate:.4g} samples per second, and a LeRobotDataset has an "
+            "integer number of frames per second; state it with --fps"
         )
     return round(rate)
 
 
 def _episodes(recording: Recording, fps: int, notes: list[str]) -> Iterator[_Episode]:
-    """The runs of a recording on the grid of `fps` frames a second, without their gaps."""
+    """The runs of a recording on the grid of `fps` frames per second, without their gaps."""
     state = np.hstack([recording.measured, recording.key_points_mm.reshape(recording.samples, -1)])
     if "temp_C" in _names(recording)[STATE]:
         assert recording.temp_C is not None
@@ -194,7 +194,7 @@ def _episodes(recording: Recording, fps: int, notes: list[str]) -> Iterator[_Epi
                 else command[rows[np.searchsorted(recording.t_s[rows], grid + 1e-9, "right") - 1]],
             )
     if moved:
-        notes.append(f"{recording.label}: {moved} frames interpolated onto {fps} frames a second")
+        notes.append(f"{recording.label}: {moved} frames interpolated onto {fps} frames per second")
 
 
 def _linear(grid: np.ndarray, t_s: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -219,7 +219,7 @@ def read_log(path: str | Path) -> tuple[Recording, str]:
     if header.rows is not None and len(rows) < header.rows:
         lacking.append(f"it was interrupted after {len(rows)} of {header.rows} samples")
     if torn:
-        lacking.append("its last line is torn and left out")
+        lacking.append("its last line is incomplete and was left out")
     return recording, "; ".join(lacking)
 
 

@@ -194,7 +194,10 @@ def _check_values(recording: Recording) -> None:
         _fail(recording, f"time of sample {back} is {now} s after {before} s, expected an increase")
     again = first_run_again(recording.run)
     if again is not None:
-        _fail(recording, f"run {recording.run[again]} comes back at sample {again} after another")
+        _fail(
+            recording,
+            f"run {recording.run[again]} appears again at sample {again}, after another run",
+        )
 
 
 def _check_sidecar_values(recording: Recording) -> None:
@@ -221,7 +224,7 @@ def first_time_backwards(t_s: np.ndarray, run: np.ndarray) -> int | None:
 
 
 def first_run_again(run: np.ndarray) -> int | None:
-    """Index of the first sample where a run's id (T,) comes back after another run."""
+    """Index of the first sample where a run's id (T,) appears again after another run."""
     starts = np.flatnonzero(np.diff(run, prepend=run[0] - 1) != 0)
     seen: set[int] = set()
     for start in starts.tolist():

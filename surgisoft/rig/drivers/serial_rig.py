@@ -45,7 +45,7 @@ class SerialRig:
         ] = "udp:9763",
         map: Annotated[Path | None, "map file: key points, channels and frame"] = None,  # noqa: A002
         chambers: Annotated[int, "number of chambers; 0: as the controller states"] = 0,
-        rate_Hz: Annotated[float, "samples a second; the cameras may be faster"] = 20.0,
+        rate_Hz: Annotated[float, "samples per second; the cameras may be faster"] = 20.0,
         rest_s: Annotated[float, "time to vent and rest before a run [s]"] = 30.0,
         watchdog_ms: Annotated[float, "the controller vents by itself after [ms]"] = 2000.0,
         silent_ms: Annotated[float, "silence of a device that ends the run [ms]"] = 1000.0,

@@ -84,7 +84,8 @@ def validation_of(error_mm: Iterable[float], key_points: int, label: str) -> Val
     each = each * key_points if len(each) == 1 else each
     if len(each) != key_points:
         raise InputError(
-            f"{label}: {len(each)} validated errors, expected one or {key_points}, one a key point"
+            f"{label}: {len(each)} validated errors, expected one or {key_points}, one per "
+            "key point"
         )
     return Validation(float(np.sqrt(np.mean(np.square(each)))), each)
 

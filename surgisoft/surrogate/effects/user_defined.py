@@ -52,7 +52,7 @@ def register_effect_file(path: str | Path, taken: Container[str] = ()) -> str:
     if path.suffix != ".py" or not name.isidentifier():
         raise InputError(f"{path}: expected a .py file whose stem is a plain name (my_effect.py)")
     if name in taken or name in RESERVED or name in offered():
-        raise InputError(f"{path}: an effect '{name}' is there already; rename the file")
+        raise InputError(f"{path}: an effect '{name}' exists already; rename the file")
     content = path.read_bytes()
     module_name = f"surgisoft_effect_{name}"
     spec = importlib.util.spec_from_file_location(module_name, path)

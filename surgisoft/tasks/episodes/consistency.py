@@ -165,7 +165,7 @@ def _contradictions(log: EpisodeLog, rows: int):
     for agent, terms in log.rewards.items():
         yield from _numbers_by_name(f"rewards of '{agent}'", terms, rows)
     if not _is_table(log.limits) or not all(map(_is_finite, log.limits.values())):
-        yield "its limits are no numbers"
+        yield "its limits are not numbers"
     elif log.limits and "clearance_mm" not in log.limits:
         yield "its limits lack the one of the clearance"
     for parts, what in ((log.beams, "beam"), (log.cameras, "camera"), (log.views, "view")):
@@ -209,7 +209,7 @@ def _of_part(name: str, part: Any, rows: int):
             continue
         shape, letter = stated
         if not isinstance(value, np.ndarray):
-            yield f"'{one.name}' of {name} is no array"
+            yield f"'{one.name}' of {name} is not an array"
         elif value.dtype.kind != letter and not (letter == "i" and value.dtype.kind == "u"):
             yield f"'{one.name}' of {name} holds {value.dtype}"
         elif sizes.wrong(value, shape):
@@ -223,19 +223,19 @@ def _of_part(name: str, part: Any, rows: int):
             yield f"'{one.name}' of {name} holds infinite numbers"
     for text in TEXTS.get(kind, ()):
         if not isinstance(getattr(part, text), str):
-            yield f"'{text}' of {name} is no text"
+            yield f"'{text}' of {name} is not a text"
     for number in NUMBERS.get(kind, ()):
         if not _is_finite(getattr(part, number)):
-            yield f"'{number}' of {name} is no number"
+            yield f"'{number}' of {name} is not a number"
     for integer in INTEGERS.get(kind, ()):
         if type(getattr(part, integer)) is not int:
-            yield f"'{integer}' of {name} is no integer"
+            yield f"'{integer}' of {name} is not an integer"
 
 
 def _of_camera(camera: CameraLog):
     near_far = camera.range_mm
     if not (isinstance(near_far, tuple) and len(near_far) == 2 and all(map(_is_finite, near_far))):
-        yield "the camera's range is no pair of numbers"
+        yield "the camera's range is not a pair of numbers"
     elif not (0.0 < camera.fov_rad < math.pi and 0.0 <= near_far[0] < near_far[1] < LARGEST_MM):
         yield "the camera's field of view or range is impossible"
 
@@ -279,18 +279,18 @@ def _of_dose(dose: DoseLog, rows: int):
 
 def _not_a_table(name: str, table: Any):
     if not _is_table(table):
-        yield f"its {name} are no table"
+        yield f"its {name} are not a table"
 
 
 def _numbers_by_name(name: str, table: Any, rows: int):
     """A table of (T,) arrays of numbers."""
     if not _is_table(table):
-        yield f"its {name} are no table"
+        yield f"its {name} are not a table"
         return
     for key, value in table.items():
         fits = isinstance(value, np.ndarray) and value.dtype.kind in "fiub"
         if not fits or value.shape != (rows,):
-            yield f"'{key}' of its {name} is no number for each of {rows} rows"
+            yield f"'{key}' of its {name} is not a number for each of {rows} rows"
 
 
 def _is_table(value: Any) -> bool:

@@ -448,4 +448,4 @@ def _end(log: EpisodeLog, ending: str) -> tuple[str, str]:
     success = log.measures.get("success")
     if success is None or success[-1] > 0.0:
         return "info", "done"
-    return ("warning", "the time is out") if ending == "time out" else ("error", "ended early")
+    return ("warning", "the time has elapsed") if ending == "time out" else ("error", "ended early")

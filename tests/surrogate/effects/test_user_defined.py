@@ -186,8 +186,8 @@ def test_opening_a_model_runs_no_code_of_it(slack, tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "complaint"),
     [
-        ("creep.py", EXAMPLE, "an effect 'creep' is there already"),
-        ("network.py", EXAMPLE, "an effect 'network' is there already"),
+        ("creep.py", EXAMPLE, "an effect 'creep' exists already"),
+        ("network.py", EXAMPLE, "an effect 'network' exists already"),
         ("my-effect.py", EXAMPLE, "plain name"),
         ("empty.py", "x = 1", "expected one complete Effect in the file, found none"),
         ("broken.py", "1 / 0", r"does not run \(ZeroDivisionError"),

@@ -95,7 +95,7 @@ def chosen(path: Path, role: FileRole) -> Reader:
             return known if name not in BINARY or _is_binary(path) else text.READER
     kind = NOT_READ.get(path.suffix.lower().removeprefix("."))
     if kind and _is_binary(path):
-        raise InputError(f"{path}: {kind}, which no reader reads; {ADVICE}")
+        raise InputError(f"{path}: {kind}, for which there is no reader; {ADVICE}")
     return text.READER
 
 

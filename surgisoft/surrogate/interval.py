@@ -10,19 +10,34 @@ et al. 2018, sec. 5.2), with the distance d to the nearest actuation of the trai
     s_k = e_k / (1 + growth d),    radius_k(level) = (1 + growth d) quantile_level(s_k).
 
 d is the Euclidean distance in actuation, each chamber in shares of its range. Far from the training
-data the interval widens; how much, is chosen among `GROWTHS` so that the mean radius at `LEVEL` is
-least. That growth is 0 where distance does not matter.
+data the interval widens with growth > 0. The most likely of `GROWTHS` is taken: the sizes of groups
+(see below) are log-normal, so it is that with the least variance of their logarithms. The growth is
+0 unless the sum of squares falls by more than one more parameter takes away by chance (F test at
+5 %, with 1 and K - 2 degrees of freedom).
 
 A further run differs from all of those that were scored, so the quantile of few runs covers too
-little of it. Each group of rows is therefore left out of the scores in turn, and all quantiles are
-multiplied by the least factor, at least 1, with which the quantiles of the others cover the groups
-left out (the jackknife of Barber et al. 2021, by groups). Where groups are alike it is near 1.
+little of it. Without an assumption on runs no finite radius is certain to hold a share `level` of
+the rows of a further run, on average over runs, unless level <= K / (K + 1), with K runs: 19 runs
+for 95 % (hierarchical conformal prediction, Lee, Barber & Willett 2023). With fewer runs the radius
+rests on an assumption: the sizes of runs, i.e. their RMS scores R_g, are log-normal. The logarithm
+of the size of a further run then follows Student's t distribution (prediction interval of a normal
+sample, Hahn & Meeker 1991, ch. 4), and the scores within a run, z = s / R_g, have the distribution
+that they have in all runs:
+
+    log R_new = mean(log R_g) + sd(log R_g) sqrt(1 + 1 / K) t_(K-1),
+    radius(level): P(R_new z <= radius) = level,
+
+with one degree of freedom less where a growth was fitted. Where runs are alike this is the quantile
+of all rows. Of fewer than `LEAST_GROUPS` groups the spread is not known: all quantiles are
+multiplied by the least factor, at least 1, with which those of the other groups cover each group
+left out (the jackknife of Barber et al. 2021, by groups).
 """
 
 import math
 from dataclasses import asdict, dataclass, replace
 
 import torch
+from scipy.special import stdtrit
 from torch import Tensor
 
 LEVEL = 0.95
@@ -32,11 +47,23 @@ LEVELS = (0.5, 0.6827, 0.8, 0.9, 0.95, 0.975, 0.99)
 GROWTHS = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0)
 """Growths of the score's scale by distance that are tried, per range of a chamber."""
 LEAST_GAIN = 0.05
-"""Least fall of the mean radius that a growth has to bring, as a share of the radius without."""
+"""Least fall of the mean radius that a growth has to bring where groups are too few for a test, as
+a share of the radius without."""
+CERTAINTY = 0.975
+"""Quantile of Student's t whose square is the threshold of the F test for a growth, at 5 %."""
+EXACT_GROUPS = math.ceil(LEVEL / (1 - LEVEL) - 1e-9)
+"""Fewest groups for `LEVEL` without an assumption on their sizes: LEVEL <= K / (K + 1)."""
+LEAST_GROUPS = 4
+"""Fewest groups from which the spread of the sizes of groups is estimated: the blocks of one run
+that a fit holds out."""
+PREDICTIVE_DRAWS = 2000
+"""Quantiles of Student's t that stand for the size of a further group."""
+LEAST_SIZE = 1e-3
+"""Least size of a group that counts, as a share of the RMS score of all rows."""
 REFERENCE_ROWS = 1500
 """Most rows of the training among which the nearest actuation is looked for."""
 MOST_GROUPS = 50
-"""Most groups that are left out one by one; of more groups the quantiles hardly depend on one."""
+"""Most groups whose spread widens the quantiles; those of more groups hardly depend on it."""
 LEAST_ROWS = 100
 """Fewest rows with a measured key point from which its quantiles are taken."""
 
@@ -95,9 +122,14 @@ class ErrorInterval:
         """What it says on a row like those of the training, in one line."""
         radii = " ".join(f"{value:.2f}" for value in self._quantile(LEVEL))
         beyond = f"; wider by {self.growth:g} x distance to the training data" * (self.growth > 0)
+        few = f"; fewer than {EXACT_GROUPS}, so it assumes log-normal sizes of their errors"
+        if self.groups < LEAST_GROUPS:
+            few = "; too few to know how much groups differ"
+        few *= self.groups < EXACT_GROUPS
         return (
-            f"{LEVEL:.0%} of held-out key points lie within (base to tip) {radii} mm of the "
-            f"prediction ({self.source}, {self.rows} rows in {self.groups} groups{beyond})"
+            f"{LEVEL:.0%} of the key points of a further run are within (base to tip) {radii} mm "
+            f"of the prediction ({self.source}, {self.rows} rows in {self.groups} "
+            f"groups{few}{beyond})"
         )
 
 
@@ -131,20 +163,11 @@ def calibrate(error: Tensor, distance: Tensor, group: Tensor, source: str) -> Er
     if int((~error.isnan()).sum(0).min()) < LEAST_ROWS:
         return None
     error, distance = error.double(), distance.double()
-
-    def mean_radius(growth: float) -> float:
-        scale = 1 + growth * distance
-        return float((scale.mean() * _quantiles(error / scale[:, None], LEVEL)).mean())
-
-    radii = {growth: mean_radius(growth) for growth in GROWTHS}
-    growth = min(radii, key=lambda growth: radii[growth])
-    if radii[growth] > (1 - LEAST_GAIN) * radii[0.0]:
-        growth = 0.0
+    growth = _growth(error, distance, group)
     scores = error / (1 + growth * distance)[:, None]
     widest, quantiles = torch.zeros_like(scores[0]), []
     for level in LEVELS:
-        wide = group_factor(scores, group, level) * _quantiles(scores, level)
-        widest = torch.maximum(widest, wide)
+        widest = torch.maximum(widest, group_quantiles(scores, group, level, 1 + (growth > 0)))
         quantiles.append(tuple(widest.tolist()))
     return ErrorInterval(
         LEVELS,
@@ -156,18 +179,110 @@ def calibrate(error: Tensor, distance: Tensor, group: Tensor, source: str) -> Er
     )
 
 
+def group_quantiles(scores: Tensor, group: Tensor, level: float, fitted: int = 1) -> Tensor:
+    """(n,) scores that hold a share `level` of the rows of a further group.
+
+    scores: (S, n), NaN where missing; group: (S,) number of the run or block of each row; fitted:
+    parameters that were fitted to the sizes of groups: their mean, and a growth. Of one group, or
+    of more than `MOST_GROUPS`, the quantiles of all rows.
+    """
+    plain = _quantiles(scores, level)
+    names, index = group.unique(return_inverse=True)
+    if not 1 < len(names) <= MOST_GROUPS:
+        return plain
+    found = []
+    for column in scores.unbind(1):
+        seen = ~column.isnan()
+        of_further = _of_further_group(column[seen], index[seen], level, fitted)
+        if of_further is None:
+            return group_factor(scores, group, level) * plain
+        found.append(of_further)
+    return plain.new_tensor(found)
+
+
+def _of_further_group(scores: Tensor, group: Tensor, level: float, fitted: int) -> float | None:
+    """Score that holds a share `level` of the rows of a further group; None for too few groups.
+
+    scores: (S,) without missing ones; group: (S,). See the module for the formula.
+    """
+    names, index = group.unique(return_inverse=True)
+    count = len(names)
+    if count < LEAST_GROUPS:
+        return None
+    size = _sizes(scores, index)
+    shape = (scores / size[index]).sort().values
+    share = (torch.arange(PREDICTIVE_DRAWS).to(scores) + 0.5) / PREDICTIVE_DRAWS
+    free = count - fitted
+    variance = float((size.log() - size.log().mean()).square().sum()) / free
+    spread = math.sqrt(variance * (1 + 1 / count))
+    drawn = (size.log().mean() + spread * torch.from_numpy(stdtrit(free, share.numpy()))).exp()
+
+    def held(radius: float) -> float:
+        """Share of the rows of further groups within a radius."""
+        below = torch.searchsorted(shape, radius / drawn, right=True)
+        return float(below.double().mean()) / len(shape)
+
+    low, high = 0.0, float(shape[-1] * drawn[-1])
+    while high - low > 1e-6 * high:
+        middle = (low + high) / 2
+        low, high = (low, middle) if held(middle) >= level else (middle, high)
+    return high
+
+
+def _growth(error: Tensor, distance: Tensor, group: Tensor) -> float:
+    """Growth of the scores' scale by distance, 0 where the sizes of groups do not show any.
+
+    Of fewer than `LEAST_GROUPS` groups: the one of least mean radius.
+    """
+    index = group.unique(return_inverse=True)[1]
+    count = int(index.max()) + 1
+    if count < LEAST_GROUPS:
+
+        def mean_radius(growth: float) -> float:
+            scale = 1 + growth * distance
+            return float((scale.mean() * _quantiles(error / scale[:, None], LEVEL)).mean())
+
+        radii = {growth: mean_radius(growth) for growth in GROWTHS}
+        best = min(radii, key=lambda growth: radii[growth])
+        return best if radii[best] <= (1 - LEAST_GAIN) * radii[0.0] else 0.0
+    spread = {
+        growth: _spread(error / (1 + growth * distance)[:, None], index) for growth in GROWTHS
+    }
+    best = min(spread, key=lambda growth: spread[growth])
+    threshold = 1 + float(stdtrit(count - 2, CERTAINTY)) ** 2 / (count - 2)
+    return best if spread[0.0] > threshold * spread[best] else 0.0
+
+
+def _spread(scores: Tensor, group: Tensor) -> float:
+    """Sum of squares of the logarithms of group sizes around their mean, over all key points.
+
+    scores: (S, n), NaN where missing; group: (S,) numbers from 0.
+    """
+    total = 0.0
+    for column in scores.unbind(1):
+        seen = ~column.isnan()
+        if seen.any():
+            log = _sizes(column[seen], group[seen].unique(return_inverse=True)[1]).log()
+            total += float((log - log.mean()).square().sum())
+    return total
+
+
+def _sizes(scores: Tensor, group: Tensor) -> Tensor:
+    """(K,) RMS score of each group, at least `LEAST_SIZE` of that of all rows; group: from 0."""
+    rows = torch.bincount(group)
+    square = torch.zeros(len(rows)).to(scores).index_add(0, group, scores.square())
+    least = LEAST_SIZE * scores.square().mean().sqrt()
+    return (square / rows).sqrt().clamp(min=float(least.clamp(min=1e-12)))
+
+
 def group_factor(scores: Tensor, group: Tensor, level: float) -> float:
     """Least factor >= 1 on quantiles by which those of all other groups cover each group left out.
 
     scores: (S, n), NaN where missing; group: (S,) number of the run or block of each row; level:
-    share of the scores of all groups left out to cover. 1 for a single group, or more than
-    `MOST_GROUPS`.
+    share of the scores of all groups left out to cover. 1 where a group left out leaves too few.
     """
-    names = group.unique()
-    if not 1 < len(names) <= MOST_GROUPS:
-        return 1.0
     ratios = torch.full_like(scores, torch.nan)
-    for name in names:
+    for name in group.unique():
         mine = group == name
         others = scores[~mine]
         if int((~others.isnan()).sum(0).min()) < LEAST_ROWS:

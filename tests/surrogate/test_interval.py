@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from surgisoft.surrogate.interval import (
     coverage_of,
     distance_to,
     group_factor,
+    group_quantiles,
 )
 from surgisoft.surrogate.model import Validation
 from surgisoft.surrogate.networks import HawEnsemble
@@ -84,31 +86,78 @@ def test_calibration_rows_are_covered_and_levels_are_nested(rows, seed, missing,
     assert (found.radius_mm(distance, level) <= found.radius_mm(distance, level + 0.01)).all()
 
 
-def runs_of_other_sizes(runs: int, seed: int):
+def runs_of_other_sizes(runs: int, seed: int, spread: float = 0.5):
     """Errors (S, 2) of runs of 200 rows, each of a size of its own (log-normal), and their runs."""
     generator = torch.Generator().manual_seed(seed)
-    size = torch.exp(0.5 * torch.randn(runs, generator=generator, dtype=torch.float64))
+    size = torch.exp(spread * torch.randn(runs, generator=generator, dtype=torch.float64))
     return gaussian(200 * runs, seed + 1, size.repeat_interleave(200)), torch.arange(
         runs
     ).repeat_interleave(200)
 
 
-def test_few_runs_that_differ_still_cover_further_ones():
-    """The quantile of all rows of eight runs covers less than 95 % of a ninth one."""
-    covered, plain = [], []
-    for seed in range(25):
-        error, group = runs_of_other_sizes(8, 100 * seed)
-        fresh = runs_of_other_sizes(40, 100 * seed + 50)[0]
-        for found, groups in ((covered, group), (plain, torch.zeros(len(group)))):
-            interval = calibrate(error, torch.zeros(len(error)), groups, "s")
-            radius = interval.radius_mm(torch.zeros(len(fresh), dtype=torch.float64))
-            found.append(coverage_of(fresh, radius))
-    assert np.mean(plain) < 0.93
-    assert 0.935 <= np.mean(covered) <= 0.97
+@pytest.mark.parametrize(("runs", "spread"), [(4, 0.5), (8, 1.0)])
+def test_few_runs_that_differ_still_cover_further_ones(runs, spread):
+    """The quantile of all rows of few runs covers less than 95 % of another one."""
+    found, plain = [], []
+    for seed in range(60):
+        error, group = runs_of_other_sizes(runs, 100 * seed, spread)
+        fresh = runs_of_other_sizes(40, 100 * seed + 50, spread)[0]
+        for covered, groups in ((found, group), (plain, torch.zeros(len(group)))):
+            covered.append(coverage_of(fresh, group_quantiles(error, groups, LEVEL)))
+    assert np.mean(plain) < 0.925
+    assert 0.935 <= np.mean(found) <= 0.975
+
+
+@pytest.mark.parametrize("level", [0.9, 0.95])
+@pytest.mark.parametrize("fitted", [1, 2])
+def test_the_size_of_a_further_run_follows_students_t(level, fitted):
+    """Runs of constant errors: the predictive quantile of a normal sample in closed form."""
+    size = torch.tensor([1.0, 2.0, 0.5, 3.0, 1.2], dtype=torch.float64)
+    rows = size.repeat_interleave(50)[:, None]
+    found = group_quantiles(rows, torch.arange(250) // 50, level, fitted)
+    log = size.log().numpy()
+    wide = log.std(ddof=fitted) * math.sqrt(1 + 1 / 5)
+    assert float(found) == pytest.approx(
+        math.exp(log.mean() + wide * stats.t(5 - fitted).ppf(level)), rel=0.01
+    )
+
+
+def distances_of_runs(runs: int, seed: int, growth: float):
+    """Errors (S, 2), distances and runs: each run at a distance and of a size of its own."""
+    rng = np.random.default_rng(seed)
+    far = torch.tensor(rng.uniform(0.0, 1.0, runs)).repeat_interleave(100)
+    error, group = gaussian(100 * runs, seed), torch.arange(runs).repeat_interleave(100)
+    size = torch.tensor(np.exp(0.3 * rng.standard_normal(runs))).repeat_interleave(100)
+    return error * ((1 + growth * far) * size)[:, None], far, group
+
+
+def test_few_runs_show_no_growth_by_chance():
+    """The errors have nothing to do with the distance, but six runs look as if they had."""
+    grown = [calibrate(*distances_of_runs(6, seed, 0.0), "s").growth > 0 for seed in range(40)]
+    assert sum(grown) <= 5
+
+
+def test_a_growth_that_runs_agree_on_is_found():
+    grown = [calibrate(*distances_of_runs(16, seed, 10.0), "s").growth for seed in range(10)]
+    assert sum(growth >= 3 for growth in grown) >= 9
+
+
+def test_a_fitted_growth_takes_a_degree_of_freedom():
+    error, far, group = distances_of_runs(8, 3, 30.0)
+    found = calibrate(error, far, group, "s")
+    assert found.growth > 0
+    scores = error / (1 + found.growth * far)[:, None]
+    expected = group_quantiles(scores, group, LEVEL, 2)
+    assert found.quantiles_mm[found.levels.index(LEVEL)] == pytest.approx(expected.tolist())
 
 
 def test_runs_that_are_alike_leave_the_interval_as_it_is():
     error = gaussian(4000, 8)
+    alike, all_rows = (
+        group_quantiles(error, group, LEVEL)
+        for group in (torch.arange(4000) // 250, torch.zeros(4000))
+    )
+    assert (alike / all_rows).tolist() == pytest.approx([1.0, 1.0], abs=0.02)
     assert group_factor(error, torch.arange(4000) // 250, LEVEL) == pytest.approx(1.0, abs=0.02)
     assert group_factor(error, torch.zeros(4000), LEVEL) == 1.0
 
@@ -128,6 +177,19 @@ def test_distance_is_in_ranges_of_the_chambers():
 
 
 INTERVAL = ErrorInterval((0.5, 0.95), ((0.1,) * 5, (0.4,) * 5), 2.0, 500, 7, "cross-validation")
+
+
+@pytest.mark.parametrize(
+    ("groups", "said"),
+    [
+        (3, "3 groups; too few to know how much groups differ; wider"),
+        (18, "18 groups; fewer than 19, so it assumes log-normal sizes of their errors; wider"),
+        (19, "19 groups; wider"),
+    ],
+)
+def test_the_interval_says_what_few_groups_leave_open(groups, said):
+    """Of K exchangeable groups and one further one, that one is the worst with 1 / (K + 1)."""
+    assert said in replace(INTERVAL, groups=groups).sentence()
 
 
 def test_a_model_keeps_its_interval_in_its_folder(tmp_path):

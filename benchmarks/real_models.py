@@ -57,6 +57,8 @@ class Fold:
     """(S, n) whether the key point lies within the 95 % interval, where the model states one."""
     radius_mm: np.ndarray | None = None
     """(S, n) radius of that interval, mm."""
+    group: np.ndarray | None = None
+    """(S,) number of the run, or of its block of time, of each row."""
 
 
 def without(history: History, left_out: torch.Tensor) -> History:
@@ -175,7 +177,8 @@ def judge(
     found = result.model.predict_interval(history)
     error = (found.key_points_mm[left_out] - measured).norm(dim=-1)
     radius = found.radius_mm[left_out]
-    folds = [Fold("this model", error.square().numpy(), (error <= radius).numpy(), radius.numpy())]
+    inside, of_left_out = (error <= radius).numpy(), group.numpy()[~kept]
+    folds = [Fold("this model", error.square().numpy(), inside, radius.numpy(), of_left_out)]
     if recurrent:
         black_box = fit(train, None, spec, FitConfig(network="recurrent", epochs=50))
         with torch.no_grad():
@@ -185,6 +188,20 @@ def judge(
     for name, points in regressions(x[kept], y[kept], group.numpy()[kept], x[~kept]).items():
         folds.append(Fold(name, np.square(points - measured.numpy()).sum(-1)))
     return folds
+
+
+def group_coverage(folds: list[Fold]) -> np.ndarray:
+    """(G,) share of the key points of each left-out run, or block, within the interval."""
+    found = []
+    for fold in folds:
+        assert fold.inside is not None
+        assert fold.group is not None
+        seen = ~np.isnan(fold.square_mm2)
+        for name in np.unique(fold.group):
+            mine = seen & (fold.group == name)[:, None]
+            if mine.any():
+                found.append(fold.inside[mine].mean())
+    return np.array(found)
 
 
 def main() -> None:
@@ -251,6 +268,12 @@ def main() -> None:
     print(
         f"coverage of the 95 % interval {coverage_of(error, radius):.1%}; "
         "key points base to tip: " + " ".join(f"{share:.1%}" for share in covered)
+    )
+    each = group_coverage(mine)
+    spread = each.std(ddof=1) / np.sqrt(len(each)) if len(each) > 1 else np.nan
+    print(
+        f"mean over {len(each)} left-out runs or blocks {each.mean():.1%} ± {spread:.1%} (standard "
+        f"error), least {each.min():.0%}"
     )
 
 

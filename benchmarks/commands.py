@@ -154,17 +154,31 @@ def intervals(
     clean: Annotated[
         int, typer.Option(min=0, help="Number of recordings of each setting without an effect.")
     ] = 32,
+    only: Annotated[
+        str, typer.Option(help="Words, with commas: settings with one in their name. Default: all.")
+    ] = "",
     processes: Processes = 2,
     work: Work = Path("runs/benchmark-intervals"),
     output: Output = None,
 ) -> None:
     """Coverage of the intervals of `amend`, and falls that it claims on clean arms."""
-    from benchmarks.intervals import cases, markdown, run
+    from benchmarks.intervals import SETTINGS, cases, markdown, run
+    from surgisoft.errors import InputError
 
+    words = [word.strip() for word in only.split(",") if word.strip()]
+    named = {
+        each.name for each in SETTINGS if not words or any(word in each.name for word in words)
+    }
+    for word in words:
+        if not any(word in name for name in named):
+            known = "; ".join(each.name for each in SETTINGS)
+            raise InputError(f"--only {word}: no setting has this in its name, expected {known}")
     some = cases(count, clean, tuple(_numbers("--robots", robots)))
+    some = [case for case in some if case.setting.name in named]
     with _kept("intervals", work) as report:
         outcomes = run(some, work, processes, report)
     command = f"surgisoft benchmark intervals --robots {robots} --count {count} --clean {clean}"
+    command += f' --only "{only}"' if words else ""
     _show("Intervals of amend", command, markdown(outcomes), output)
 
 

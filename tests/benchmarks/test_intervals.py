@@ -2,7 +2,9 @@
 
 import pytest
 
-from benchmarks.intervals import SETTINGS, Case, Covered, Outcome, coverage_interval
+import surgisoft.cli
+from benchmarks import intervals
+from benchmarks.intervals import SETTINGS, Case, Covered, Outcome, cases, coverage_interval
 
 OWN = next(each for each in SETTINGS if each.law == "own")
 RIG = next(each for each in SETTINGS if each.law == "rig" and each.effect != "clean")
@@ -46,3 +48,20 @@ def test_the_network_of_a_robot_is_one_value_however_often_it_is_recorded():
         (0.025 ** (1 / 24), 1.0)
     )
     assert coverage_interval(outcomes(RIG, [1, 2], [0, 0])) == pytest.approx((0.0, 1 - 0.025**0.5))
+
+
+def test_only_leaves_out_settings_without_a_word_in_their_name(monkeypatch, tmp_path):
+    """The cases left are those of the whole study: their takes do not change."""
+    asked = []
+    monkeypatch.setattr(intervals, "run", lambda some, *rest: asked.extend(some) or [])
+    arguments = ["benchmark", "intervals", "--robots", "7", "--count", "2", "--clean", "1"]
+    folder = ["--work", str(tmp_path), "-o", str(tmp_path / "page.md")]
+    assert surgisoft.cli.run([*arguments, "--only", "creep, threefold", *folder]) == 0
+    expected = [case for case in cases(2, 1, (7,)) if case.setting.effect in ("creep", "payload")]
+    assert asked == [case for case in expected if case.setting.law == "own"]
+    assert '--only "creep, threefold"' in (tmp_path / "page.md").read_text()
+
+
+def test_only_knows_the_settings(capsys):
+    assert surgisoft.cli.run(["benchmark", "intervals", "--only", "creeep"]) == 2
+    assert "--only creeep: no setting has this in its name" in capsys.readouterr().err

@@ -70,9 +70,12 @@ def assert_close(one, other):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=2e-4, equal_nan=True)
 
 
-def test_pressure_by_hand():
+@pytest.mark.parametrize("compiled", [True, False])
+def test_pressure_by_hand(compiled):
     """Commands +3 (clipped from 5) and -1 kPa from 20 kPa; tau = 0.2 s, dt = 0.1 s."""
     world = single_arm_world(WorldConfig(randomisation=STILL), start_kPa=(20.0, 20.0, 20.0))
+    if not compiled:
+        world.arms["arm"] = world.arms["arm"].reference()
     state = world.start(streams(0, 1))
     state = world.step(state, {"arm": torch.tensor([[5.0, -1.0, 0.0]])})
     share = 1.0 - math.exp(-0.5)
@@ -87,8 +90,11 @@ def test_pressure_by_hand():
     assert state.steps.tolist() == [2]
 
 
-def test_pressure_stays_within_the_arms_limits():
+@pytest.mark.parametrize("compiled", [True, False])
+def test_pressure_stays_within_the_arms_limits(compiled):
     world = single_arm_world(WorldConfig(randomisation=STILL))
+    if not compiled:
+        world.arms["arm"] = world.arms["arm"].reference()
     state = world.start(streams(0, 2))
     for _ in range(40):
         state = world.step(state, {"arm": torch.tensor([[3.0] * 3, [-3.0] * 3])})

@@ -182,50 +182,60 @@ class CrossValidation:
     """Held-out errors of sets of sensitivities."""
 
     split: Split
-    fields: np.ndarray
-    """(rows, n, 3, 1 + K) residual and sensitivities, mm; 0 where missing."""
+    fields: tuple[np.ndarray, ...]
+    """Residual and sensitivities, mm, side by side: (rows, n, 3, 1 + k) and, of sensitivities that
+    were added later, (rows, n, 3, k); 0 where missing."""
     grams: np.ndarray
     """(L, folds, 1 + K, 1 + K) products of them over the fitted rows, static part out."""
-    held_out: np.ndarray
-    """(L, 1 + K, 1 + K, B) the same of what the static part leaves on each held-out block."""
+    held_out: "HeldOut"
+    """The same of what the static part leaves on each held-out block."""
     turned: list[np.ndarray]
     """For each fold (F, n, 3, 1 + K) products of the static part's basis and `fields`."""
     cache: dict = field(default_factory=dict)
     """Held-out sums of squares and amplitudes by sensitivities."""
 
     @classmethod
-    def on(cls, split: Split, sensitivities: np.ndarray) -> "CrossValidation":
-        """The cross-validation of sensitivities (rows, n, 3, K) on a split."""
-        *field, count = sensitivities.shape
-        both = np.empty((*field, 1 + count), np.float32)
+    def on(
+        cls, split: Split, sensitivities: np.ndarray | Sequence[np.ndarray]
+    ) -> "CrossValidation":
+        """The cross-validation of sensitivities (rows, n, 3, K), or of several such arrays side by
+        side, on a split."""
+        given = [sensitivities] if isinstance(sensitivities, np.ndarray) else sensitivities
+        count = sum(each.shape[3] for each in given)
+        both = np.empty((*split.residual[: split.rows].shape, 1 + count), np.float32)
         both[..., 0] = split.residual[: split.rows]
-        both[..., 1:] = sensitivities
+        first = 1
+        for each in given:
+            both[..., first : first + each.shape[3]] = each
+            first += each.shape[3]
         both[~split.seen[: split.rows]] = 0.0
         known = split.residual[split.rows :]
         turned = split.turned(both, known)
-        grams, held_out = _products(split, both, turned, both, turned)
+        grams, lines = _products(split, (both,), turned, (both,), turned)
         grams[:, :, 0, 0] += np.square(known, dtype=float).sum()
-        return cls(split, both, grams, held_out, turned)
+        none = np.empty((len(lines), 1 + count, 0, lines.shape[2]), np.float32)
+        return cls(split, (both,), grams, HeldOut(lines, none), turned)
 
     def extended(self, sensitivities: np.ndarray) -> "CrossValidation":
         """This cross-validation with further sensitivities (rows, n, 3, K') after its own."""
         more = _masked(self.split, sensitivities)
-        both = np.concatenate([self.fields, more], axis=3)
+        fields = (*self.fields, more)
         turned = self.split.turned(more)
         whole = [np.concatenate(pair, axis=3) for pair in zip(self.turned, turned, strict=True)]
-        beside = _products(self.split, both, whole, more, turned)
-        grams = _bordered(self.grams, beside[0], axis=2)
-        held_out = _bordered(self.held_out, beside[1], axis=1)
-        return CrossValidation(self.split, both, grams, held_out, whole, dict(self.cache))
+        grams, lines = _products(self.split, fields, whole, (more,), turned)
+        border = lines.reshape(len(lines), *grams.shape[2:], -1)
+        grams = _bordered(self.grams, grams)
+        held_out = self.held_out.extended(border)
+        return CrossValidation(self.split, fields, grams, held_out, whole, dict(self.cache))
 
     def level_losses(self) -> np.ndarray:
         """(L, B) held-out sum of squared distances, mm^2, of the features alone at each ridge."""
-        return self.held_out[:, 0, 0].astype(float)
+        return self.held_out.first[:, 0].astype(float)
 
     @property
     def sensitivities(self) -> int:
         """Number of sensitivities, K."""
-        return self.fields.shape[3] - 1
+        return sum(each.shape[3] for each in self.fields) - 1
 
     @property
     def counts(self) -> np.ndarray:
@@ -236,7 +246,7 @@ class CrossValidation:
 
     def losses(self, chosen: Sequence[int] | np.ndarray = ()) -> np.ndarray:
         """(B,) held-out sum of squared distances of each block with chosen sensitivities, mm^2."""
-        sensitivities = np.unique(np.asarray(chosen, int))
+        sensitivities = _rising(chosen)
         tried, _ = self._solved(sensitivities)
         ridges = len(RIDGES) if len(sensitivities) > 1 else 1
         tried = tried[:, :ridges].reshape(-1, tried.shape[2])
@@ -258,12 +268,13 @@ class CrossValidation:
         mix[0, 0] = 1.0
         owner = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
         mix[np.arange(1, len(columns)), 1 + owner] = amplitudes
-        products = np.moveaxis(self.held_out[level][columns[:, None], columns], -1, 0)
+        products = np.moveaxis(self.held_out.among(columns)[level], -1, 0)
         return mix.T @ products.astype(float) @ mix
 
     def _fitted(self, chosen: np.ndarray) -> tuple[np.ndarray, int]:
         """(k,) amplitudes of the chosen sensitivities, mean over the folds, and their level."""
-        sensitivities, where = np.unique(np.asarray(chosen, int), return_inverse=True)
+        sensitivities = _rising(chosen)
+        where = np.searchsorted(sensitivities, chosen)
         tried, amplitudes = self._solved(sensitivities)
         sums = tried.sum(axis=2)
         level, ridge = np.unravel_index(sums.argmin(), sums.shape)
@@ -276,9 +287,53 @@ class CrossValidation:
             rows = np.concatenate([[0], sensitivities + 1])
             amplitudes = _amplitudes(self.grams[:, :, rows[:, None], rows])
             losses = np.empty((*amplitudes.shape[:2], len(self.split.fold)))
-            _sum_squares(self.held_out, rows, amplitudes, self.split.fold, losses)
+            products = self.held_out
+            _sum_squares(
+                products.first, products.further, rows, amplitudes, self.split.fold, losses
+            )
             self.cache[key] = losses, amplitudes
         return self.cache[key]
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Products of columns on each held-out block, mm^2, in single precision.
+
+    They are symmetric, so each pair is kept once: a page of fresh memory costs more than the
+    products that fill it. Columns that are added later have arrays of their own.
+    """
+
+    first: np.ndarray
+    """(L, C (C + 1) / 2, B) of the first C columns; column i with j <= i is in line
+    i (i + 1) / 2 + j."""
+    further: np.ndarray
+    """(L, C + A, A, B) of all columns with A columns that were added."""
+
+    @property
+    def columns(self) -> int:
+        """Number of columns, C + A."""
+        return self.further.shape[1]
+
+    def extended(self, border: np.ndarray) -> "HeldOut":
+        """These products with those (L, C + A + N, N, B) of all columns with N new ones."""
+        size = self.columns
+        known = self.columns - self.further.shape[2]
+        mirrored = np.swapaxes(border[:, known:size], 1, 2)
+        older = np.concatenate([self.further, mirrored], axis=1)
+        return HeldOut(self.first, np.concatenate([older, border], axis=2))
+
+    def among(self, columns: np.ndarray) -> np.ndarray:
+        """(L, k, k, B) products of some columns (k,)."""
+        levels, blocks, count = len(self.first), self.first.shape[2], len(columns)
+        answer = np.empty((levels, count, count, blocks), np.float32)
+        for level, i, j in np.ndindex(levels, count, count):
+            answer[level, i, j] = _pair(self.first, self.further, level, columns[i], columns[j])
+        return answer
+
+
+def _rising(chosen: Sequence[int] | np.ndarray) -> np.ndarray:
+    """The different numbers among some, in rising order; faster than `np.unique` for few."""
+    return np.array(sorted(set(map(int, chosen))), int)
 
 
 def _masked(split: Split, sensitivities: np.ndarray) -> np.ndarray:
@@ -288,34 +343,51 @@ def _masked(split: Split, sensitivities: np.ndarray) -> np.ndarray:
     return answer
 
 
+def _side_by_side(fields: Sequence[np.ndarray], rows: np.ndarray) -> np.ndarray:
+    """(s, n, 3, C) some rows of fields (rows, n, 3, c)."""
+    if len(fields) == 1:
+        return fields[0][rows]
+    return np.concatenate([each[rows] for each in fields], axis=3)
+
+
 def _products(split: Split, a, turned_a, b, turned_b) -> tuple[np.ndarray, np.ndarray]:
-    """(grams, held_out) of CrossValidation from columns of two fields (rows, n, 3, A or B)."""
-    levels, folds, size = len(split.ridges), len(split.bases), (a.shape[3], b.shape[3])
+    """(grams, lines) of the columns of two sets of fields (rows, n, 3, .), A and B in number.
+
+    grams: (L, folds, A, B) as in CrossValidation. lines: (L, A B, blocks) products on each held-out
+    block; where both sets are the same one, (L, A (A + 1) / 2, blocks), as in HeldOut.
+    """
+    levels, folds = len(split.ridges), len(split.bases)
+    size = (turned_a[0].shape[3], turned_b[0].shape[3])
+    same = a is b or (len(a) == len(b) and all(x is y for x, y in zip(a, b, strict=True)))
+    count = size[0] * (size[0] + 1) // 2 if same else size[0] * size[1]
     parts = np.empty((folds, *size))
     grams = np.empty((levels, folds, *size))
-    held_out = np.empty((levels, *size, len(split.fold)), np.float32)
-    by_block = np.empty((len(split.fold), *size), np.float32)
+    answer = np.empty((levels, count, len(split.fold)), np.float32)
+    by_block = np.empty((len(split.fold), count), np.float32)
     for level in range(levels):
         for number, rows in enumerate(split.held):
-            own_b = b[rows]
-            own_a = own_b if a is b else a[rows]
+            own_b = _side_by_side(b, rows)
+            own_a = own_b if same else _side_by_side(a, rows)
             if not level:
                 parts[number] = _product(own_a, own_b)
             mine = split.shrunk(turned_b[number], number, level)
             grams[level, number] = _product(turned_a[number], mine)
             right = split.away(own_b, mine, number)
             left = right
-            if a is not b:
+            if not same:
                 left = split.away(own_a, split.shrunk(turned_a[number], number, level), number)
             block = split.block[rows]
             for one in np.unique(block):
                 own = _at_once(np.flatnonzero(block == one))
-                by_block[one] = _product(left[own], right[own])
+                if same:
+                    some = right[own]
+                    _lower(_product(some, some), by_block[one])
+                else:
+                    by_block[one] = _product(left[own], right[own]).reshape(-1)
         # A set of columns is then looked up in lines of all blocks, which the cache holds.
-        lines = held_out[level].reshape(-1, len(by_block))
-        _transpose(by_block.reshape(len(by_block), -1), lines)
+        _transpose(by_block, answer[level])
     np.subtract(parts.sum(axis=0) - parts, grams, out=grams)
-    return grams, held_out
+    return grams, answer
 
 
 def _at_once(places: np.ndarray, count: int | None = None) -> np.ndarray | slice:
@@ -333,18 +405,24 @@ def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a.reshape(-1, a.shape[-1]).T @ b.reshape(-1, b.shape[-1])
 
 
-def _bordered(inner: np.ndarray, border: np.ndarray, axis: int) -> np.ndarray:
-    """Symmetric matrices (C, C) from (A, A) and their last columns (C, C - A).
-
-    axis: that of the matrices' rows; that of their columns follows.
-    """
-    lead, first, size = (slice(None),) * axis, inner.shape[axis], border.shape[axis]
-    answer = np.empty((*inner.shape[:axis], size, size, *inner.shape[axis + 2 :]), inner.dtype)
-    answer[(*lead, slice(first), slice(first))] = inner
-    answer[(*lead, slice(None), slice(first, None))] = border
-    corner = np.swapaxes(border[(*lead, slice(first))], axis, axis + 1)
-    answer[(*lead, slice(first, None), slice(first))] = corner
+def _bordered(inner: np.ndarray, border: np.ndarray) -> np.ndarray:
+    """Symmetric matrices (..., C, C) from (..., A, A) and their last columns (..., C, C - A)."""
+    first, size = inner.shape[-1], border.shape[-2]
+    answer = np.empty((*inner.shape[:-2], size, size), inner.dtype)
+    answer[..., :first, :first] = inner
+    answer[..., first:] = border
+    answer[..., first:, :first] = np.swapaxes(border[..., :first, :], -1, -2)
     return answer
+
+
+@compiled
+def _lower(matrix, out):
+    """Write the lower triangle of a matrix (C, C) into out (C (C + 1) / 2), row by row."""
+    place = 0
+    for row in range(len(matrix)):
+        for column in range(row + 1):
+            out[place] = matrix[row, column]
+            place += 1
 
 
 @compiled
@@ -359,11 +437,23 @@ def _transpose(matrix, out):
 
 
 @compiled
-def _sum_squares(held_out, rows, amplitudes, fold, losses):
+def _pair(first, further, level, one, other):
+    """(B,) products of two columns at a level, as they lie in HeldOut."""
+    known = further.shape[1] - further.shape[2]
+    if other >= known:
+        return further[level, one, other - known]
+    if one >= known:
+        return further[level, other, one - known]
+    high = max(one, other)
+    return first[level, high * (high + 1) // 2 + min(one, other)]
+
+
+@compiled
+def _sum_squares(first, further, rows, amplitudes, fold, losses):
     """Held-out sums of squares into losses (L, r, B), mm^2: x' G x with x = (1, -amplitudes).
 
-    held_out (L, C, C, B) products G of all columns; rows (1 + k,) those that are looked at;
-    amplitudes (L, r, folds, k); fold (B,) of each block.
+    first and further: products G of all columns, as in HeldOut; rows (1 + k,) those that are looked
+    at; amplitudes (L, r, folds, k); fold (B,) of each block.
 
     G is rounded to single precision, so that a sum is not known better than ROUNDING times the
     largest products in it. Where large amplitudes of nearly collinear columns cancel, the rest
@@ -383,10 +473,10 @@ def _sum_squares(held_out, rows, amplitudes, fold, losses):
             for i in range(size):
                 along[:] = 0.0
                 for j in range(size):
-                    product = held_out[level, rows[i], rows[j]]
+                    product = _pair(first, further, level, rows[i], rows[j])
                     for block in range(blocks):
                         along[block] += product[block] * mix[j, block]
-                own = held_out[level, rows[i], rows[i]]
+                own = _pair(first, further, level, rows[i], rows[i])
                 for block in range(blocks):
                     total[block] += mix[i, block] * along[block]
                     least[block] += own[block] * mix[i, block] * mix[i, block]

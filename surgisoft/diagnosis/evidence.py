@@ -335,8 +335,8 @@ def collinearity(selection: ModelSelection, best: Score, other: Score) -> float:
     """
     seen = np.isfinite(selection.problem.residual)
     own = list(best.option.chosen)
-    change = selection.sensitivities[..., own] @ selection.validation.amplitudes(own)
-    design = selection.sensitivities[..., list(other.option.chosen)][seen].astype(float)
+    change = selection.sensitivities(own) @ selection.validation.amplitudes(own)
+    design = selection.sensitivities(other.option.chosen)[seen].astype(float)
     target = change[seen]
     gram = design.T @ design
     ridge = COLLINEAR_RIDGE * np.trace(gram) / len(gram) * np.eye(len(gram))

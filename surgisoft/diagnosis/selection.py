@@ -108,8 +108,6 @@ class ModelSelection:
     validation: CrossValidation
     options: dict[str, list[Option]]
     """Forms of each effect."""
-    sensitivities: np.ndarray
-    """(S, n, 3, K) all sensitivities, mm, in the candidates' precision."""
     floor: np.ndarray
     """(B,) sum of squared noise in each block, mm^2."""
     fitted: dict = field(default_factory=dict)
@@ -118,9 +116,8 @@ class ModelSelection:
     @classmethod
     def of(cls, problem: Problem, candidates: list[Candidate]) -> "ModelSelection":
         """Prepare the selection; afterwards every set of effects is cheap to try."""
-        nothing = np.zeros((*problem.residual.shape, 0), np.float32)
-        sensitivities = np.concatenate([nothing, *(c.sensitivities for c in candidates)], axis=3)
-        validation = CrossValidation.on(split_of(problem), sensitivities)
+        given = [candidate.sensitivities for candidate in candidates]
+        validation = CrossValidation.on(split_of(problem), given)
         options: dict[str, list[Option]] = {}
         for option in _options_of(candidates):
             options.setdefault(option.effect, []).append(option)
@@ -133,9 +130,7 @@ class ModelSelection:
                     chosen = sum((choices[i].chosen for i in some), ())
                     choices.append(Option(name, chosen, None, len(chosen)))
         noise = float(np.mean(problem.noise_mm**2))
-        return cls(
-            problem, candidates, validation, options, sensitivities, validation.counts * noise
-        )
+        return cls(problem, candidates, validation, options, validation.counts * noise)
 
     def extended(self, more: list[Candidate]) -> "ModelSelection":
         """The selection with further candidates of its effects; known results are kept."""
@@ -143,16 +138,35 @@ class ModelSelection:
             return self
         sensitivities = np.concatenate([c.sensitivities for c in more], axis=3)
         options = {name: list(choices) for name, choices in self.options.items()}
-        for option in _options_of(more, len(self.candidates), self.sensitivities.shape[3]):
+        for option in _options_of(more, len(self.candidates), self.validation.sensitivities):
             options.setdefault(option.effect, []).append(option)
         return replace(
             self,
             candidates=[*self.candidates, *more],
             validation=self.validation.extended(sensitivities),
             options=options,
-            sensitivities=np.concatenate([self.sensitivities, sensitivities], axis=3),
             fitted=dict(self.fitted),
         )
+
+    @cached_property
+    def _place(self) -> list[tuple[int, int]]:
+        """The candidate of each sensitivity, and its number among the candidate's own."""
+        counts = [each.sensitivities.shape[3] for each in self.candidates]
+        return [(number, own) for number, count in enumerate(counts) for own in range(count)]
+
+    @cached_property
+    def _precision(self) -> np.dtype:
+        """The precision that holds all candidates."""
+        kinds = (each.sensitivities.dtype for each in self.candidates)
+        return np.result_type(np.float32, *kinds)
+
+    def sensitivities(self, chosen: Sequence[int]) -> np.ndarray:
+        """(S, n, 3, k) some sensitivities, mm, in the candidates' precision."""
+        answer = np.empty((len(chosen), *self.problem.residual.shape), self._precision)
+        for place, one in enumerate(chosen):
+            number, own = self._place[one]
+            answer[place] = self.candidates[number].sensitivities[..., own]
+        return np.moveaxis(answer, 0, -1)
 
     def losses(self, chosen: tuple[int, ...] = ()) -> np.ndarray:
         """(B,) held-out sum of squared distances, mm^2, with the chosen sensitivities."""
@@ -258,9 +272,8 @@ class ModelSelection:
     def _static_share(self, option: Option, base: tuple[int, ...]) -> float:
         """Share of what an effect explains that is a cubic of the actuation."""
         amplitudes = self._amplitudes(option, base)
-        part = (self.sensitivities[..., list(option.chosen)] @ amplitudes).reshape(
-            len(self.sensitivities), -1
-        )
+        part = self.sensitivities(option.chosen) @ amplitudes
+        part = part.reshape(len(part), -1)
         part = part - part.mean(axis=0)
         known = self._cubics.T @ part
         return float(np.square(known).sum() / max(np.square(part).sum(), 1e-30))
@@ -393,7 +406,7 @@ def beside_relaxed(selection: ModelSelection, named: Sequence[Score], further: S
     chosen = further.option.chosen
     sensitivities = [
         _relaxed_sensitivities(selection, named, _by_state),
-        selection.sensitivities[..., list(chosen)],
+        selection.sensitivities(chosen),
     ]
     together = np.concatenate(sensitivities, axis=3)
     validation, total = CrossValidation.on(selection.validation.split, together), together.shape[3]
@@ -410,9 +423,9 @@ def _relaxed_sensitivities(
     choices = [selection.freest(score) for score in named]
     base = sum(choices, ())
     amplitudes = selection.validation.amplitudes(base)
-    sensitivities, first = [selection.sensitivities[..., list(base)]], 0
+    sensitivities, first = [selection.sensitivities(base)], 0
     for chosen in choices:
-        part = selection.sensitivities[..., list(chosen)] @ amplitudes[first : first + len(chosen)]
+        part = selection.sensitivities(chosen) @ amplitudes[first : first + len(chosen)]
         sensitivities.append(scaled(selection, part))
         first += len(chosen)
     return np.concatenate(sensitivities, axis=3)
@@ -571,7 +584,7 @@ class Selected:
         alone = [score.option.chosen for score in self.first if score.effect in effects[:1]]
         chosen = next(iter(same + alone), ())
         amplitudes = self.selection.validation.amplitudes(chosen)
-        return self.selection.sensitivities[..., list(chosen)] @ amplitudes
+        return self.selection.sensitivities(chosen) @ amplitudes
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,5 +1,7 @@
 """Held-out errors of sets of columns, against fitting each fold anew."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -100,13 +102,16 @@ def test_features_have_the_discrepancys_covariance():
     assert features @ features.T == pytest.approx(kernel(x, d, x, d), abs=1e-4)
 
 
-def test_further_columns_are_as_if_they_had_been_there(data):
+@pytest.mark.parametrize("cuts", [[1], [1, 2]])
+def test_further_columns_are_as_if_they_had_been_there(data, cuts):
+    """Columns that are added in one go, and one after the other."""
     features, residual, columns, *rest = data
     size = np.array([0.3, 0.5]), np.array([0.1, 0.1])
     whole = cross_validated(*data, *size)
     found = cross_validated(features, residual, columns[..., :1], *rest, *size)
     first = found.losses([0])
-    found = found.extended(columns[..., 1:])
+    for low, high in itertools.pairwise([*cuts, COLUMNS]):
+        found = found.extended(columns[..., low:high])
     assert found.sensitivities == COLUMNS
     found.cache.clear()  # else what was known before would be compared with itself
     assert found.losses([0]) == pytest.approx(first, rel=1e-6)

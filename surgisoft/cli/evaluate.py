@@ -113,11 +113,12 @@ def evaluate(
     rigs = _rig_config(on, rig, robot_seed, hidden, cameras, observer_gain, preflight)
 
     from surgisoft.agents.session import evaluate as evaluate_policies
-    from surgisoft.experiments.session import ExperimentRules
 
     of_task: object = config
     laid: Rules | None = None
     if rules:
+        from surgisoft.experiments.session import ExperimentRules
+
         spec = _experiment(rules, task, config)
         place = {"scene": spec.scene} if spec.in_scene else {}
         task, of_task = spec.scenario, replace(spec.task, **place)

@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -222,3 +224,14 @@ def test_a_policy_of_another_scene_is_warned_of(tmp_path):
         EvaluationRequest(("ring",), scene=scene).resolved(told.append)
     assert len(told) == 1
     assert "ring was trained in another scene (phantom_liver) than other" in told[0]
+
+
+def test_the_command_without_pictures_imports_none_of_their_libraries():
+    """Matplotlib and Rerun, which only pages and replays need, take a second to import."""
+    code = (
+        "import sys; from surgisoft.cli import run; "
+        "run('evaluate random --task track_circle --episodes 1'.split()); "
+        "print(sorted({'matplotlib', 'rerun', 'torch'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "['torch']"

@@ -109,7 +109,7 @@ class Fall:
             else "on held-out data"
         )
         if self.claimed:
-            return f"error {numbers}"
+            return f"error reduced from {numbers}"
         why = "is too small"
         if low <= 0:
             why = "is not significant"
@@ -210,7 +210,8 @@ class Amendment:
         if self.model_error is not None:
             whole = self.model_error
             assert self.change is not None
-            text = text.replace("error ", f"change since {' + '.join(self.change.before)}: ", 1)
+            change = f"unexplained change since {' + '.join(self.change.before)} "
+            text = text.replace("error ", change, 1)
             text += f"; error of the model itself {whole.before:.3f} to {whole.after:.3f} mm"
             return f"{text}, its network's last layer re-tuned" if self.retuned else text
         if not self.retuned:
@@ -221,7 +222,9 @@ class Amendment:
     def _together(self) -> str:
         """The outcome of a joint fit in words."""
         if self._seen_before:
-            head = "error" if self.alone.significant else "no fall of the error is claimed:"
+            head = "error reduced from"
+            if not self.alone.significant:
+                head = "no fall of the error is claimed:"
             where = "on rows that neither training saw"
             return (
                 f"{head} {self.alone.numbers(where)}, fitted together with the network, compared "

@@ -48,10 +48,10 @@ NUMBERS = "0.500 to 0.200 mm on held-out data (fall 0.300 mm, 95 % 0.100 to 0.40
 @pytest.mark.parametrize(
     ("fields", "sentence"),
     [
-        ({}, f"creep: error {NUMBERS}"),
+        ({}, f"creep: error reduced from {NUMBERS}"),
         (
             {"retuned": True},
-            f"creep: error {NUMBERS}; 0.150 mm with the network's last layer re",
+            f"creep: error reduced from {NUMBERS}; 0.150 mm with the network's last layer re",
         ),
         (
             {"alone": fall(ci95=(-0.1, 0.4))},
@@ -59,7 +59,11 @@ NUMBERS = "0.500 to 0.200 mm on held-out data (fall 0.300 mm, 95 % 0.100 to 0.40
         ),
         (
             {"change": CHANGE, "model_error": fall(2.0, 1.5)},
-            "creep: change since monday + tuesday: 0.500 to 0.200 mm",
+            "creep: unexplained change since monday + tuesday reduced from 0.500 to 0.200 mm",
+        ),
+        (
+            {"change": CHANGE, "model_error": fall(2.0, 1.5), "alone": fall(ci95=(-0.1, 0.4))},
+            "creep: no fall of the unexplained change since monday + tuesday is claimed: 0.500 to",
         ),
         (
             {"refit": object()},
@@ -98,7 +102,7 @@ def test_an_improvement_says_what_was_added():
     rounds = (SimpleNamespace(step="creep", error_mm=0.2), SimpleNamespace(step=None, error_mm=0.2))
     found = Improvement(None, rounds, (), fall(), (None, None), 1.0)
     assert found.claimed
-    assert found.sentence == f"creep: error {NUMBERS}"
+    assert found.sentence == f"creep: error reduced from {NUMBERS}"
     nothing = Improvement(
         None, (SimpleNamespace(step=None, error_mm=None, sentence="it fits"),), (), fall(),
         (None, None), 1.0,

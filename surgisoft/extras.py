@@ -43,6 +43,8 @@ EXTRA_OF_USE = {
     "demo": "all",
 }
 """The extra that a command or function needs in whole, by its name."""
+WITH_SCENE = ("train", "replay", "segmentation")
+"""Extras that install the extra `scene`, too."""
 
 
 def missing_library(error: ModuleNotFoundError, use: str = "") -> str | None:
@@ -53,5 +55,8 @@ def missing_library(error: ModuleNotFoundError, use: str = "") -> str | None:
     name = (error.name or "").partition(".")[0]
     if name not in EXTRA_OF:
         return None
-    extra = EXTRA_OF_USE.get(use, EXTRA_OF[name])
+    own = EXTRA_OF[name]
+    extra = EXTRA_OF_USE.get(use, own)
+    if extra not in ("all", own) and not (own == "scene" and extra in WITH_SCENE):
+        extra = f"{extra},{own}"
     return f"the package '{name}' is missing; install it with: pip install 'surgisoft[{extra}]'"

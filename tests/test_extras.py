@@ -23,14 +23,15 @@ sys.meta_path.insert(0, Absent())
 """A program's first lines: the libraries of the extras cannot be imported."""
 
 
-def core(code, *arguments):
-    """What a program prints in an environment without the extras."""
-    program = WITHOUT.format(names=sorted(EXTRA_OF)) + code
+def core(code, *arguments, without=EXTRA_OF, cwd=None):
+    """What a program prints in an environment without the extras, or without some modules."""
+    program = WITHOUT.format(names=sorted(without)) + code
     return subprocess.run(
         [sys.executable, "-c", program, *map(str, arguments)],
         capture_output=True,
         text=True,
         check=False,
+        cwd=cwd,
     )
 
 
@@ -92,6 +93,9 @@ MISSING = {
     "train --task track_circle": "train",
     "scene check phantom_liver": "scene",
     "replay x.rrd": "replay",
+    "evaluate scripted --task track_circle": "train",
+    "evaluate scripted --task track_circle --replay x.rrd": "train,replay",
+    "compare default x.parquet --replay x.rrd": "replay",
     "collect mixed --rig elastica -o x.parquet": "elastica",
 }
 """Commands that need an extra, and which."""
@@ -128,6 +132,20 @@ def test_a_missing_library_names_its_extra(said, arguments, extra):
     assert code == 2
     assert errors.count("\n") == 1
     assert f"pip install 'surgisoft[{extra}]'" in errors
+
+
+def test_policies_are_evaluated_without_the_replay_extra(tmp_path):
+    """`[train]` alone: no command that draws no replay imports Rerun."""
+    done = core(
+        """
+from surgisoft.cli import run
+print(run("evaluate scripted --task track_circle --episodes 1 --json x.json".split()))
+""",
+        without={"rerun", "rerun_cli", "rerun_bindings"},
+        cwd=tmp_path,
+    )
+    assert done.stdout.splitlines()[-1] == "0", done.stderr[-2000:]
+    assert (tmp_path / "x.json").is_file()
 
 
 def test_python_names_the_extra_too(said):

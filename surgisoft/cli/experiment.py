@@ -145,11 +145,12 @@ def list_(
         ),
     ] = None,
 ) -> None:
-    """List the experiments of a folder or a scene."""
+    """List the experiments of a folder or a scene, packaged ones by their names."""
     from surgisoft.experiments.plan import settings
-    from surgisoft.experiments.session import experiments_of, open_experiment
+    from surgisoft.experiments.session import experiments_of, find_experiment, open_experiment
 
     for path in experiments_of(folder):
         spec = open_experiment(path)
         settings_ = counted(len(settings(spec)), "setting")
-        print(f"{path}: {settings_} x {counted(spec.repeats, 'episode')}. {spec.note}")
+        name = path.stem if find_experiment(path.stem) == path else path
+        print(f"{name}: {settings_} x {counted(spec.repeats, 'episode')}. {spec.note}")

@@ -3,6 +3,7 @@
 import os
 from collections import Counter
 from collections.abc import Iterable
+from importlib.util import find_spec
 from pathlib import Path
 
 from surgisoft.errors import InputError
@@ -47,7 +48,11 @@ def check_new_folder(path: Path | None) -> None:
 
 
 def check_replay(path: Path | None) -> None:
-    """Raise InputError unless a replay may be written there; an older one is replaced."""
+    """Raise InputError unless a replay may be written there; an older one is replaced.
+
+    Raises ModuleNotFoundError without the Rerun library, which would otherwise be missed only when
+    the work is done.
+    """
     if path is None:
         return
     if path.suffix != ".rrd":
@@ -55,6 +60,8 @@ def check_replay(path: Path | None) -> None:
     if path.is_dir():
         raise InputError(f"{path}: is a folder, expected a file to write")
     check_folder(path.absolute().parent)
+    if find_spec("rerun") is None:
+        raise ModuleNotFoundError("No module named 'rerun'", name="rerun")
 
 
 MANY_PICTURES = 4

@@ -325,7 +325,7 @@ def _error_pictures(drawn: list[Path]) -> list[Part]:
     """What step 3 shows: body, loops and error; the broad ones scroll on a narrow page."""
     by_name = {path.stem: path for path in drawn}
     return [
-        Picture.from_file(by_name["body"], "Measured and predicted bodies", drawn=True),
+        Picture.from_file(by_name["body"], "Measured and predicted bodies"),
         Picture.from_file(
             by_name["loops"], "Loops, measured and predicted", "", BROAD_PX, drawn=True
         ),

@@ -116,8 +116,8 @@ class Improvement:
         if self.claimed and fall.in_fit:
             where = f"on rows of which the given model had been fitted to {fall.in_fit:.0%}"
             return (
-                f"{names}: error reduced from {fall.numbers(where)}, fitted together with the network; none of "
-                "these errors is on unseen data"
+                f"{names}: error reduced from {fall.numbers(where)}, fitted together with the "
+                "network; none of these errors is on unseen data"
             )
         return f"{names}: {fall.sentence}"
 

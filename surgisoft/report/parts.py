@@ -151,7 +151,8 @@ class Picture:
     least_px: int = 0
     """Smallest width in pixels; on a narrower page the picture scrolls in its own frame."""
     drawn: bool = False
-    """Dark lines on white paper: a dark page shows the picture inverted, hues kept."""
+    """Dark lines on white paper: a dark page shows the picture inverted, hues kept. Not for a
+    picture with a colour scale, whose largest values would become the darkest."""
 
     @classmethod
     def from_file(

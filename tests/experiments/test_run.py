@@ -153,7 +153,7 @@ def test_list_names_what_is_shipped(capsys):
     assert run(["experiment", "list"]) == 0
     out = capsys.readouterr().out
     for name in ("liver", "multi_lesion", "fault", "sweep", "contours", "area", "breathing"):
-        assert f"{name}.toml: " in out
+        assert f"\n{name}: " in f"\n{out}", "by the name that `run` takes"
 
 
 def test_old_results_stay_until_the_new_ones_have_begun(whole, tmp_path, monkeypatch):

@@ -200,7 +200,7 @@ def improve_page(
     failed: list[Part] = []
     if drawn is not None:
         alt = "The body before and after, measured and predicted, with one scale of the errors"
-        failed.append(Picture.from_file(drawn, alt, f"{alt}; held-out part", 620, drawn=True))
+        failed.append(Picture.from_file(drawn, alt, f"{alt}; held-out part", 620))
     captions = {
         f"Error on the held-out part: {_use(fall) if fall.in_fit else 'not used in any round'}": (
             held_out

@@ -55,6 +55,8 @@ PICTURES = {
 """Caption of each picture by the stem of its file."""
 SIDE_BY_SIDE = "Measured and predicted bodies of each model, with one scale of the errors"
 """Caption of the picture of several models."""
+COLOUR_SCALE = "body"
+"""Stem of the picture with a colour scale, which keeps its colours on a dark page."""
 BROAD_PX = {"loops": 620, "error": 620}
 """Width below which a picture scrolls, pixels."""
 
@@ -80,7 +82,7 @@ def compare_page(
                         PICTURES[path.stem],
                         PICTURES[path.stem],
                         BROAD_PX.get(path.stem, 0),
-                        drawn=True,
+                        drawn=path.stem != COLOUR_SCALE,
                     )
                     for path in pictures
                     if path.stem in PICTURES
@@ -370,9 +372,7 @@ def together_page(compared: Sequence[Compared], title: str, drawn: Sequence[Path
         charts = [_models_over_time(compared)]
         small = [_models_along(compared)]
         small += [_models_over(compared, name) for name in _telling(compared)]
-    pictures = [
-        Picture.from_file(path, SIDE_BY_SIDE, SIDE_BY_SIDE, 620, drawn=True) for path in drawn
-    ]
+    pictures = [Picture.from_file(path, SIDE_BY_SIDE, SIDE_BY_SIDE, 620) for path in drawn]
     return Page(
         title=title,
         verdict=verdict,

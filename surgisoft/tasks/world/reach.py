@@ -64,7 +64,7 @@ def blank_mounts(
             if spec.length_mm is None:
                 raise InputError(
                     f"{model}: the arm model states no length; fit it to recordings whose sidecar "
-                    "has length_mm"
+                    "has length_mm in [arm]"
                 )
             mount = replace(
                 mount,

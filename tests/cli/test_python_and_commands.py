@@ -104,8 +104,10 @@ def test_improve_gives_one_result(lab):
     told = ["What was measured", "Where the model failed", "What was missing", "What it is worth"]
     places = [text.index(f"<h2>{part}") for part in [*told, "What is left, and what to record"]]
     assert places == sorted(places)
-    first = improved.diagnoses[0].ranking[0]
-    assert f"{first.effect} alone leaves {first.heldout_rmse_mm:.3f} mm" in text
+    first, *others = improved.diagnoses[0].ranking
+    assert f"By itself, {first.effect} leaves {first.heldout_rmse_mm:.3f} mm" in text
+    least = min(other.heldout_rmse_mm for other in others)
+    assert f"leaves least, {least:.3f} mm" in text
     assert ("<td>added</td>" in text) == bool(improved.steps)
     for name in ("story/bodies.png", "story.rrd"):
         assert (lab / name).stat().st_size > 10_000

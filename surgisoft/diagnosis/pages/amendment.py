@@ -316,14 +316,15 @@ def _ranking_words(first: Diagnosis, added: Sequence[str]) -> str:
     """The first few of the ranking in a sentence."""
     best, *others = first.ranking
     text = (
-        f"{best.effect} alone leaves {best.heldout_rmse_mm:.3f} mm of "
+        f"By itself, {best.effect} leaves {best.heldout_rmse_mm:.3f} mm of "
         f"{first.error_mm.before:.3f} mm on held-out blocks"
     )
     if others:
-        text += f"; the next best, {others[0].effect}, {others[0].heldout_rmse_mm:.3f} mm"
+        least = min(others, key=lambda each: each.heldout_rmse_mm)
+        text += f"; of the others, {least.effect} leaves least, {least.heldout_rmse_mm:.3f} mm"
     more = [name for name in added if name not in (best.effect, NETWORK)]
     if more:
-        text += f". Added too, in later rounds or beside it: {', '.join(more)}"
+        text += f". Also added, in later rounds or beside it: {', '.join(more)}"
     return text + "."
 
 

@@ -262,16 +262,17 @@ class _Track:
         good = (at >= 3) & (at < len(self.steps_mm) - 3)
         return np.where(good, self.steps_mm[at] / np.maximum(usual, 1e-12), 0.0)
 
-    def ratio_of(self, row: int, step_mm: float) -> float:
-        """A step of this length to a sample against the usual steps before and after it.
+    def ratios_of(self, rows: np.ndarray, steps_mm: np.ndarray) -> np.ndarray:
+        """(C,) steps of these lengths (C,) to samples (C,) against the usual steps before and after
+        each.
 
         0 where the track has no step.
         """
         if not len(self.steps_mm):
-            return 0.0
-        at = np.searchsorted(self.rows[1:-1], [row])
+            return np.zeros(len(rows))
+        at = np.searchsorted(self.rows[1:-1], rows)
         usual = np.maximum(self._usual(at - STEP_WINDOW), self._usual(at + 1))
-        return float(step_mm / max(usual[0], 1e-12))
+        return steps_mm / np.maximum(usual, 1e-12)
 
     def _usual(self, first: np.ndarray) -> np.ndarray:
         """(C,) median of the steps in the window that begins at each of these, as far as known."""
@@ -291,11 +292,13 @@ class _Track:
         padding = np.full(STEP_WINDOW, np.nan)
         return np.concatenate([padding, self.steps_mm, padding])
 
-    def ratio_near(self, row: int) -> float:
-        """The largest ratio of the steps that end within one fresh position of a sample."""
-        at = int(np.searchsorted(self.rows[1:], row))
-        near = np.arange(max(0, at - 1), min(len(self.steps_mm), at + 2))
-        return float(self.ratios(near).max(initial=0.0))
+    def ratios_near(self, rows: np.ndarray) -> np.ndarray:
+        """(C,) the largest ratio of the steps that end within one fresh position of each sample."""
+        near = np.searchsorted(self.rows[1:], rows)[:, None] + np.array([-1, 0, 1])
+        there = (near >= 0) & (near < len(self.steps_mm))
+        ratios = np.zeros(near.shape)
+        ratios[there] = self.ratios(near[there])
+        return ratios.max(axis=1, initial=0.0)
 
 
 def _track(points: np.ndarray, start: int) -> _Track:
@@ -331,10 +334,12 @@ def key_point_jumps(recording: Recording) -> dict[int, list[tuple[int, float]]]:
                 if i != j
             ]
             large = np.flatnonzero(track.steps_mm > JUMP_SHARE * motion_mm)
-            for at in large[track.ratios(large) > JUMP_RATIO].tolist():
-                row = int(track.rows[at + 1])
-                size = float(np.linalg.norm(points[row, j] - points[int(track.rows[at]), j]))
-                if not _explained(recording, others, run, row, size, size / motion_mm):
+            at = large[track.ratios(large) > JUMP_RATIO]
+            rows, before = track.rows[at + 1], track.rows[at]
+            sizes = [float(np.linalg.norm(step)) for step in points[rows, j] - points[before, j]]
+            explained = _explained(recording, others, run, rows, np.array(sizes), motion_mm)
+            for row, size, known in zip(rows.tolist(), sizes, explained, strict=True):
+                if not known:
                     hits.setdefault(j, []).append((row, size))
     return hits
 
@@ -379,21 +384,28 @@ def _explained(
     recording: Recording,
     others: list[tuple[_Track, float]],
     run: slice,
-    row: int,
-    size: float,
-    share: float,
-) -> bool:
-    """Whether a step [mm], a share of the motion, comes with a move of the actuation in the second
-    before, and with steps of the other key points, as far as these would stand out of the noise.
+    rows: np.ndarray,
+    sizes: np.ndarray,
+    motion_mm: float,
+) -> np.ndarray:
+    """(C,) bool: whether a step (C,) [mm] to a sample (C,) comes with a move of the actuation in
+    the second before, by a share of its range that the step's share of the motion asks for, and
+    with steps of the other key points, as far as these would stand out of the noise.
 
     others: tracks of the other key points, each with its motion over that of the one that steps.
     """
-    witnesses = [other for other, part in others if other.ratio_of(row, size * part) > JUMP_RATIO]
-    if witnesses and not any(other.ratio_near(row) > JUMP_RATIO / 2 for other in witnesses):
-        return False
-    early = np.searchsorted(recording.t_s[run], recording.t_s[row] - 1.0) + run.start
-    rows = slice(int(max(run.start, min(early, row - 5))), row + 1)
-    return _actuation_moves(recording, rows, ACTUATION_SHARE * share)
+    witnessed, shared = np.zeros(len(rows), bool), np.zeros(len(rows), bool)
+    for other, part in others:
+        sees = other.ratios_of(rows, sizes * part) > JUMP_RATIO
+        witnessed |= sees
+        shared[sees] |= other.ratios_near(rows[sees]) > JUMP_RATIO / 2
+    answer = ~witnessed | shared
+    for i in np.flatnonzero(answer).tolist():
+        row, share = int(rows[i]), float(sizes[i]) / motion_mm
+        early = np.searchsorted(recording.t_s[run], recording.t_s[row] - 1.0) + run.start
+        stretch = slice(int(max(run.start, min(early, row - 5))), row + 1)
+        answer[i] = _actuation_moves(recording, stretch, ACTUATION_SHARE * share)
+    return answer
 
 
 def _jump(j: int, found: list[tuple[int, float]]) -> QualityWarning:

@@ -91,8 +91,9 @@ def floor(robot: int, poses: int = Randomisation.history) -> Floor:
     rest = steady_key_points(arm.model, kPa[:, 0].double().numpy())
     bodies = torch.tensor(rest, dtype=torch.float32)[:, None]
     for each, pressure, body in zip(off, kPa, bodies, strict=True):
-        memory, now, _ = estimator.updated(memory, each, pressure, body)
-        learned.append(now[0])
+        found = estimator.updated(memory, each, pressure, body)
+        memory = found.memory
+        learned.append(found.now_mm[0])
     raw = torch.nan_to_num(off[first:, 0])
     return Floor(
         raw_mm=_beam_mm(arm, true, goal, raw[after:]),

@@ -172,7 +172,9 @@ class Observer:
         turn = part.mount[:, :3, :3]
         off = (measured - part.points_mm) @ turn
         body = (part.points_mm - part.mount[:, None, :3, 3]) @ turn
-        memory, now, lead = self.learner.updated(part.plant.adaptation, off, pressure, body)
-        offset = self.learner.expected(memory, pressure) @ turn.mT
-        plant = replace(part.plant, adaptation=memory)
-        return now @ turn.mT, replace(part, plant=plant, offset_mm=offset, lead_mm=lead @ turn.mT)
+        found = self.learner.updated(part.plant.adaptation, off, pressure, body)
+        now, lead, offset = (
+            each @ turn.mT for each in (found.now_mm, found.lead_mm, found.next_mm)
+        )
+        plant = replace(part.plant, adaptation=found.memory)
+        return now, replace(part, plant=plant, offset_mm=offset, lead_mm=lead)

@@ -4,6 +4,7 @@ The parameters of the key points are fixed (their share of the chord length at r
 spline's values and derivatives are a constant matrix times the key points, whatever the batch.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,19 @@ class Backbone:
     @classmethod
     def through(cls, rest_mm: Tensor, samples: int = 21, degree: int = 3) -> "Backbone":
         """A backbone for an arm whose key points at rest are `rest_mm`, (n, 3) in mm."""
+        where = np.linspace(0.0, 1.0, samples)
+        return cls._at(rest_mm, degree, lambda _: where)
+
+    @classmethod
+    def at_key_points(cls, rest_mm: Tensor, degree: int = 3) -> "Backbone":
+        """The same backbone, sampled at the n key points themselves (K = n)."""
+        return cls._at(rest_mm, degree, lambda knots: knots)
+
+    @classmethod
+    def _at(
+        cls, rest_mm: Tensor, degree: int, where: Callable[[np.ndarray], np.ndarray]
+    ) -> "Backbone":
+        """A backbone that is sampled where a function of the key points' parameters (n,) says."""
         rest = np.asarray(rest_mm.detach().cpu(), dtype=np.float64)
         if len(rest) < 2:
             raise InputError(
@@ -36,10 +50,10 @@ class Backbone:
             raise InputError("backbone: two key points coincide at rest, expected a proper chain")
         knots = np.concatenate([[0.0], np.cumsum(steps)]) / steps.sum()
         spline = make_interp_spline(knots, np.eye(len(rest)), k=min(degree, len(rest) - 1))
-        where = np.linspace(0.0, 1.0, samples)
+        at = where(knots)
         return cls(
-            torch.tensor(spline(where), dtype=torch.float32),
-            torch.tensor(spline.derivative()(where), dtype=torch.float32),
+            torch.tensor(spline(at), dtype=torch.float32),
+            torch.tensor(spline.derivative()(at), dtype=torch.float32),
         )
 
     def to(self, device: str | torch.device) -> "Backbone":

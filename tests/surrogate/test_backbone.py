@@ -73,3 +73,15 @@ def test_two_key_points_make_a_line_and_one_is_refused():
         Backbone.through(REST[:1])
     with pytest.raises(InputError, match="coincide"):
         Backbone.through(torch.zeros(3, 3))
+
+
+def test_at_the_key_points_it_passes_through_them_and_along_the_arc():
+    """Uneven spacing; the tangents of an arc of 0.5 rad, within 2e-3."""
+    share = torch.tensor([0.0, 0.2, 0.45, 0.7, 1.0], dtype=torch.float64)
+    rest = torch.stack([0 * share, 0 * share, 70 * share], -1)
+    backbone = Backbone.at_key_points(rest)
+    torch.testing.assert_close(backbone.position, torch.eye(5), atol=1e-6, rtol=0.0)
+    angle = 0.5 * share
+    expected = torch.stack([angle.sin(), 0 * angle, angle.cos()], -1).float()
+    found = backbone.tangents(arc(0.5, share).float())
+    torch.testing.assert_close(found, expected, atol=2e-3, rtol=0.0)

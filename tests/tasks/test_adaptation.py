@@ -13,7 +13,7 @@ from surgisoft.surrogate.checkpoint import default_arm
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import ConstantCurvature
 from surgisoft.surrogate.reach import steady_key_points
-from surgisoft.tasks.world.adaptation import LAGS, AdaptationPrior, DisturbanceEstimator
+from surgisoft.tasks.world.adaptation import AdaptationPrior, DisturbanceEstimator
 from surgisoft.tasks.world.arm import Randomisation
 from surgisoft.tasks.world.observer import AlphaBetaFilter
 from surgisoft.tasks.world.random_streams import streams
@@ -37,7 +37,7 @@ def pressures(steps, seed=0):
 
 def still(estimator):
     """(1, n, 3) mm: the model's key points at rest."""
-    return (estimator.rest_mm @ estimator.shapes.mT).unflatten(1, (-1, 3))
+    return estimator.rest_mm.unflatten(1, (-1, 3))
 
 
 def learned(estimator, off, at, bodies=None):
@@ -48,7 +48,7 @@ def learned(estimator, off, at, bodies=None):
     memory, found = estimator.start(off.shape[1]), []
     bodies = still(estimator).expand(len(off), off.shape[1], -1, -1) if bodies is None else bodies
     for each, pressure, body in zip(off, at, bodies, strict=True):
-        memory, now, _ = estimator.updated(memory, each, pressure, body)
+        memory, now, _, _ = estimator.updated(memory, each, pressure, body)
         found.append(now)
     return memory, torch.stack(found)
 
@@ -59,19 +59,12 @@ def test_without_transients_it_is_bayesian_linear_regression(model):
     at = pressures(40)
     off = 0.3 * torch.randn(40, 1, 5, 3, generator=torch.Generator().manual_seed(1))
     memory, _ = learned(estimator, off, at)
-    spec = model.spec
-    rest, low, high = (np.array(each) for each in (spec.rest, spec.low, spec.high))
-    load = (at[:, 0].numpy() - rest) / np.maximum(high - rest, rest - low)
-    products = [load[:, a] * load[:, b] for a in range(3) for b in range(a, 3)]
-    inputs = np.column_stack((np.ones(40), load, *products))
-    shapes = estimator.shapes.double().numpy()
-    seen = off.double().reshape(40, 15).numpy() @ shapes
-    prior = estimator.deviation.double().numpy()[:, :10] ** 2
-    for shape in range(15):
-        precision = inputs.T @ inputs / 0.08**2 + np.diag(1.0 / prior[shape])
-        expected = np.linalg.solve(precision, inputs.T @ seen[:, shape] / 0.08**2)
-        found = memory.mean[0, shape, :10].double().numpy() * np.sqrt(prior[shape])
-        np.testing.assert_allclose(found, expected, atol=2e-3)
+    body = still(estimator).expand(40, -1, -1)
+    inputs = estimator.errors.displacements(at[:, 0], body).double().flatten(0, 1).numpy()
+    precision = inputs.T @ inputs / 0.08**2 + np.eye(inputs.shape[1])
+    expected = np.linalg.solve(precision, inputs.T @ off.double().flatten().numpy() / 0.08**2)
+    found = memory.mean[0, : len(expected)].double().numpy()
+    np.testing.assert_allclose(found, expected, atol=5e-3 * np.abs(expected).max())
 
 
 def test_a_constant_disturbance_of_any_shape_leaves_no_error(model):
@@ -100,13 +93,15 @@ def test_a_lost_key_point_is_stood_in_for_by_what_is_expected(model):
     estimator = DisturbanceEstimator(model, 0.1)
     off = torch.ones(50, 1, 5, 3)
     at = pressures(1).expand(50, -1, -1)
-    memory, _ = learned(estimator, off, at)
-    expected = estimator.expected(memory, at[0])
+    memory, _ = learned(estimator, off[:-1], at[:-1])
+    body = still(estimator)
+    memory, _, _, expected = estimator.updated(memory, off[-1], at[-1], body)
     lost = expected.clone()
     lost[0, 2] = torch.nan
-    after, now, _ = estimator.updated(memory, lost, at[0], still(estimator))
+    after, now, _, _ = estimator.updated(memory, lost, at[0], body)
     torch.testing.assert_close(now, expected, atol=1e-5, rtol=0.0)
-    torch.testing.assert_close(after.mean[..., :-1], memory.mean[..., :-1], atol=1e-5, rtol=0.0)
+    known = estimator.known
+    torch.testing.assert_close(after.mean[:, known], memory.mean[:, known], atol=1e-5, rtol=0.0)
 
 
 THINS = 1.5
@@ -137,8 +132,8 @@ def test_the_share_of_the_motion_that_comes_late_is_learned(model, share):
     estimator = DisturbanceEstimator(model, 0.1)
     bodies, off, at = moved(model, estimator, share)
     memory, _ = learned(estimator, off, at, bodies)
-    found = float(estimator.late_share(memory.mean, memory.covariance))
-    assert found == pytest.approx(share, abs=0.15)
+    found = float(estimator.late_share(memory.mean))
+    assert found == pytest.approx(share, abs=0.25)
 
 
 def test_controllers_see_late_motion_through_a_filter_where_most_of_it_is_late(model):
@@ -153,8 +148,7 @@ def test_controllers_see_late_motion_through_a_filter_where_most_of_it_is_late(m
         body = torch.tensor(steady_key_points(model, at.numpy()), dtype=torch.float32)
         found = estimator.updated(memory, share * (bodies[-1] - body), at, body)
         leads[share] = float((found.lead_mm).norm()), float((bodies[-1] - body).norm())
-        after = estimator.expected(found.memory, at) - found.now_mm
-        torch.testing.assert_close(after, found.lead_mm, atol=0.05, rtol=0.0)
+        torch.testing.assert_close(found.next_mm - found.now_mm, found.lead_mm, atol=0.05, rtol=0.0)
     assert leads[0.0][0] < 1e-3
     lead, step = leads[1.3]
     assert lead == pytest.approx(1.3 * step * math.exp(-0.1 / estimator.prior.filter_s), rel=0.15)
@@ -228,19 +222,25 @@ def noisy(rows, seed):
     return 0.08 * torch.randn(rows, 1, 5, 3, generator=torch.Generator().manual_seed(seed))
 
 
-def test_a_disturbance_that_grows_with_the_square_of_the_loads_is_learned(model):
-    """A fifth is left of what the best linear function of the loads leaves (NumPy's lstsq)."""
-    estimator = DisturbanceEstimator(model, 0.1, replace(STILL, curve_mm=1.0))
-    at = pressures(400, 6)
-    load = ((at - estimator.rest) / estimator.reach).numpy()[:, 0]
-    shape = torch.randn(5, 3, generator=torch.Generator().manual_seed(7))
-    amount = load[:, 0] ** 2 - load[:, 1] * load[:, 2]
-    off = torch.tensor(amount, dtype=torch.float32)[:, None, None, None] * shape
-    _, found = learned(estimator, off + noisy(400, 8), at)
-    left = (found - off).flatten(1).norm(dim=1)[300:].mean() / shape.norm()
-    line = np.column_stack((np.ones(400), load))
-    linear = amount - line @ np.linalg.lstsq(line, amount, rcond=None)[0]
-    assert left < 0.2 * np.abs(linear[300:]).mean()
+def test_what_one_chamber_does_wrong_is_known_at_pressures_that_were_never_measured(model):
+    """A chamber pushes 5 % more. After 2 s at each of ten pressures less than half is left at a
+    hundred others of what a linear function of the loads for each coordinate leaves, which was
+    fitted to the same measurements (NumPy's lstsq)."""
+    estimator = DisturbanceEstimator(model, 0.1, STILL)
+    at = torch.cat((pressures(10, 6).repeat_interleave(20, 0), pressures(100, 7)))
+    more = at * torch.tensor([1.05, 1.0, 1.0])
+    bodies, off = (torch.tensor(steady_key_points(model, p[:, 0].numpy())) for p in (at, more))
+    bodies, off = bodies.float()[:, None], (off - bodies).float()[:, None]
+    measured = off[:200] + noisy(200, 8)
+    memory, _ = learned(estimator, measured, at[:200], bodies[:200])
+    rows = estimator.errors.displacements(at[200:, 0], bodies[200:, 0])
+    found = (rows @ memory.mean[0, estimator.known]).numpy()
+    wanted = off[200:, 0].flatten(1).numpy()
+    load = np.column_stack((np.ones(300), at[:, 0].numpy()))
+    fitted = np.linalg.lstsq(load[:200], measured.flatten(1).numpy(), rcond=None)[0]
+    left, others = (np.sqrt(np.mean((e - wanted) ** 2)) for e in (found, load[200:] @ fitted))
+    assert left < 0.5 * others
+    assert left < 0.1 * np.sqrt(np.mean(wanted**2))
 
 
 def test_the_variance_of_transients_follows_the_arm(model):
@@ -255,15 +255,27 @@ def test_the_variance_of_transients_follows_the_arm(model):
     assert unrest["slips"] > 2.0
 
 
-def test_an_arm_with_many_chambers_has_squares_of_loads_alone():
-    """Six chambers have 21 products of two loads; the filter holds 6 of them."""
-    spec = ArmSpec(6, 3, (0.0,) * 6, (40.0,) * 6, length_mm=70.0)
-    low, high = torch.zeros(6), torch.full((6,), 40.0)
-    arm = ArmModel(spec, ConstantCurvature(low, high, key_points=3))
+def test_an_arm_with_many_chambers_is_adapted():
+    """Six chambers have errors of their own loads only, three key points two segments: constant and
+    linear pushes, mount, segments (2 shares, 3 kinds by 1 and 6 loads), planes."""
+    ends = (0.0,) * 6, (40.0,) * 6
+    spec = ArmSpec(6, 3, *ends, length_mm=70.0)
+    arm = ArmModel(spec, ConstantCurvature(*(torch.tensor(end) for end in ends), key_points=3))
     estimator = DisturbanceEstimator(arm, 0.1)
-    assert estimator.deviation.shape == (9, 1 + 6 + 6 + len(LAGS) + 1)
-    load = estimator.rest + 0.5 * estimator.reach
-    memory = estimator.start(2)
-    points = torch.zeros(2, 3, 3)
-    found = estimator.updated(memory, points + 0.1, load.expand(2, -1), points)
-    assert found.now_mm.isfinite().all()
+    assert estimator.errors.count == 6 + 6 + 6 + 2 * (2 + 3 * 7) + 9
+    at = torch.full((200, 2, 6), 20.0)
+    body = torch.tensor(steady_key_points(arm, at[0].numpy()), dtype=torch.float32)
+    off = torch.full((200, 2, 3, 3), 0.2)
+    _, found = learned(estimator, off, at, body.expand(200, -1, -1, -1))
+    torch.testing.assert_close(found[-1], off[-1], atol=0.02, rtol=0.0)
+
+
+def test_the_covariance_stays_positive_definite(model):
+    """After 4,000 steps of motion over the whole range, in float32."""
+    estimator = DisturbanceEstimator(model, 0.1)
+    at = pressures(4000, 11)
+    bodies = torch.tensor(steady_key_points(model, at[:, 0].numpy()), dtype=torch.float32)[:, None]
+    memory, _ = learned(estimator, noisy(4000, 12), at, bodies)
+    values = torch.linalg.eigvalsh(memory.covariance[0].double())
+    assert 0.0 < float(values.min()) < 1e-3
+    torch.testing.assert_close(memory.covariance, memory.covariance.mT, atol=0.0, rtol=0.0)

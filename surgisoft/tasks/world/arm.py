@@ -23,6 +23,7 @@ from surgisoft.surrogate.compiled_step import CompiledStep
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.units import KPA_PER
 from surgisoft.tasks.world.adaptation import AdaptationPrior, DisturbanceEstimator
+from surgisoft.tasks.world.arm_errors import ErrorPrior
 from surgisoft.tasks.world.compiled_arm import draw_body, drive, place
 from surgisoft.tasks.world.observer import AlphaBetaFilter, Belief
 from surgisoft.tasks.world.random_effects import RandomEffects
@@ -314,7 +315,10 @@ class ModelArm:
         self._random_effects = RandomEffects(self.model) if randomisation.effects_mm > 0 else None
         self._learner = None
         if self.observer.adapts:
-            prior = AdaptationPrior(chambers_kPa=per_kPa * AdaptationPrior.chambers_kPa)
+            prior = AdaptationPrior(
+                ErrorPrior(push_kPa=per_kPa * ErrorPrior.push_kPa),
+                chambers_kPa=per_kPa * AdaptationPrior.chambers_kPa,
+            )
             self._learner = DisturbanceEstimator(self.model, dt_s, prior, device)
 
     def reference(self) -> ModelArm:
@@ -618,10 +622,9 @@ class ModelArm:
         assert self._learner is not None
         assert belief.adaptation is not None
         turn, told = self.pose[:3, :3], self.per_kPa * pressure
-        memory, now, lead = self._learner.updated(belief.adaptation, off @ turn, told, shape)
-        offset = self._learner.expected(memory, told) @ turn.mT
-        belief = replace(belief, adaptation=memory, offset_mm=offset)
-        return now @ turn.mT, lead @ turn.mT, belief
+        found = self._learner.updated(belief.adaptation, off @ turn, told, shape)
+        belief = replace(belief, adaptation=found.memory, offset_mm=found.next_mm @ turn.mT)
+        return found.now_mm @ turn.mT, found.lead_mm @ turn.mT, belief
 
 
 class LoneArm:

@@ -105,7 +105,7 @@ def check_free(folder: Path) -> None:
         raise InputError(f"{folder}: cannot be written, {above} is not a writable folder")
     if (folder / "config.json").is_file():
         raise InputError(
-            f"{folder}: a run exists already; continue it with --resume {folder} or choose "
+            f"{folder}: a run already exists; continue it with --resume {folder} or choose "
             "another name"
         )
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

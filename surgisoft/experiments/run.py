@@ -106,7 +106,7 @@ def open_results(spec: Experiment, folder: Path, resume: bool = False, force: bo
             )
         if not force:
             raise InputError(
-                f"{folder}: results exist already; --resume continues them, --force replaces them"
+                f"{folder}: results already exist; --resume continues them, --force replaces them"
             )
     check_playable(spec)
     about: dict[str, object] = {"versions": versions()}

@@ -180,7 +180,7 @@ def test_results_go_on_only_with_their_own_scene(tmp_path):
     spec, folder = spec_of(tmp_path), tmp_path / "results"
     open_results(spec, folder)
     open_results(spec, folder, resume=True)
-    with pytest.raises(InputError, match="results exist already; --resume continues them"):
+    with pytest.raises(InputError, match="results already exist; --resume continues them"):
         open_results(spec, folder)
     with pytest.raises(InputError, match="holds another experiment"):
         open_results(replace(spec, repeats=spec.repeats + 1), folder, resume=True)

@@ -83,5 +83,5 @@ def test_what_ends_early_leaves_whole_steps_or_nothing(tmp_path, monkeypatch, fa
     assert [path.name for path in folder.iterdir()] == ["index.html"]
     page = (folder / "index.html").read_text()
     assert page.count("<section") == 1
-    assert "4 steps follow" in page
+    assert "4 more steps follow" in page
     assert "the cut" in page

@@ -264,7 +264,7 @@ def test_the_command_finds_the_newest_and_says_what_is_wrong(log, replay, tmp_pa
     other.write_text("x")
     assert "expected a replay" in told(other)
     (tmp_path / "false.rrd").write_text("nothing")
-    assert "no Rerun recording" in told(tmp_path / "false.rrd")
+    assert "is not a Rerun recording" in told(tmp_path / "false.rrd")
     assert "expected WIDTHxHEIGHT" in told(replay.path, "--size", "big")
     assert "at most one" in told(replay.path, "--web", "--screenshot", tmp_path / "a.png")
     assert "give --screenshot" in told(replay.path, "--time", "3")

@@ -83,9 +83,12 @@ def write_onnx(
                 opset_version=OPSET,
                 dynamo=True,
                 verbose=False,
+                # The rewriter takes minutes for an observer's 10,000 nodes; runtimes optimise
+                # a graph when they load it.
+                optimize=False,
             )
             assert made is not None  # the exporter of torch 2.5 and before gives nothing back
-            content = made.model_proto.SerializeToString()
+            content = _bare(made.model_proto).SerializeToString()
         except ImportError:
             raise
         except Exception as error:
@@ -102,6 +105,13 @@ def write_onnx(
         return tuple(torch.from_numpy(np.asarray(out)) for out in found)
 
     return call
+
+
+def _bare(model):
+    """An onnx.ModelProto without what the exporter notes of its nodes: paths and lines of code."""
+    for node in [*model.graph.node, *(node for each in model.functions for node in each.node)]:
+        del node.metadata_props[:]
+    return model
 
 
 def largest_difference(

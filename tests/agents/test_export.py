@@ -84,6 +84,9 @@ def test_other_programs_get_the_same_actions(policy, exported):
     seen, done = seen_and_done(policy)
     assert np.abs(done).max() > 1e-3
     onnx.checker.check_model(str(exported / "arm.onnx"))
+    for name in ("arm.onnx", "controller.onnx"):  # nothing of the machine that exported them
+        assert b"site-packages" not in (exported / name).read_bytes()
+        assert b"controller.py" not in (exported / name).read_bytes()
     session = ReferenceEvaluator(str(exported / "arm.onnx"))
     script = torch.jit.load(str(exported / "arm.pt"))
     for rows in (slice(None), slice(3, 4)):

@@ -42,9 +42,12 @@ SHORT = {
     "two_laser_ring": {},
 }
 """Fields that make an episode of a task short, and its feed begin within it."""
-ROUNDING_MM = 1e-3
-"""Tolerance of an estimated key point: places of bases are sums that round otherwise, by 1e-5 mm,
-and the first updates of the observer's covariance, in single precision, amplify that."""
+AGREE_MM = 1e-4
+"""Tolerance of an estimated key point."""
+ROUNDING_MM = {"keyhole_ablation": 1e-3, "two_laser_ring": 1e-3}
+"""The same where rounding is amplified: carriages feed the arms in, whose places are sums that
+round otherwise, by 1e-5 mm; with three arms the first updates of the observer's covariance, in
+single precision, leave 6e-4 mm."""
 STRANGE = RigConfig(seed=1, settle_s=0.3)
 """Another robot than the one that the model was fitted to."""
 
@@ -121,7 +124,7 @@ def test_the_controller_of_every_task_does_on_the_rig_what_evaluate_does(name):
     controller = running(ControllerGraph(task, actors))
     found = check_on_rig(controller, task, ActorPolicy(actors), STRANGE, seed=3)
     assert found.decisions == 25
-    assert found.points_mm < ROUNDING_MM
+    assert found.points_mm < ROUNDING_MM.get(name, AGREE_MM)
     assert found.commands_kPa < 1e-3
 
 

@@ -306,7 +306,7 @@ def make_episodes(folder: Path) -> None:
         with torch.inference_mode():
             episodes = Episodes(task, donate=True)
             state = episodes.seeded(4, 1)
-            recorder = EpisodeRecorder(task, state, driver="scripted", seed=4)
+            recorder = EpisodeRecorder(task, state, policy="scripted", seed=4)
             for _ in range(12):
                 actions = task.script(state)
                 state, outcome = episodes.step(state, actions)

@@ -230,7 +230,7 @@ class EpisodeRecorders:
                     self.task,
                     now.state,
                     row,
-                    driver=self.policy,
+                    policy=self.policy,
                     seed=self.seed,
                     on=self.on,
                     episode=number,

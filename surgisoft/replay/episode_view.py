@@ -241,7 +241,7 @@ def write_replay(
     """
     began, path = time.perf_counter(), Path(path)
     plots = plots_of(log)
-    identity = f"{log.task}-{log.driver}-{log.on}-{log.seed}-{log.episode}"
+    identity = f"{log.task}-{log.policy}-{log.on}-{log.seed}-{log.episode}"
     blueprint = episode_blueprint(log, plots)
     with new_recording(path, "surgisoft_episode", identity, blueprint) as recording:
         columns = Columns(recording, log.time_s)
@@ -480,7 +480,7 @@ def legend(log: EpisodeLog) -> str:
     roles = {body.role for body in log.bodies}
     lines += [f"- **see-through**: {name}, in front of the work" for name in hiding_bodies(log)]
     lines += [f"- **{c}**: {role}" for role, c in ROLE_NAMES.items() if role in roles]
-    what = f"**{log.task}** by {log.driver} in {log.on}"
+    what = f"**{log.task}** by {log.policy} in {log.on}"
     last = f": {log.events[-1].text} at {log.events[-1].time_s:.1f} s" if log.events else ""
     return f"{what}{last}.\n\n" + "\n".join(lines) + "\n"
 

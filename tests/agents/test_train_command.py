@@ -37,7 +37,7 @@ def test_trains_and_prints_the_result(tmp_path, capsys):
     assert [row["steps"] for row in rows] == [192, 384, 576]
     assert [*(folder / "tensorboard").glob("events*")]
     log = load_episode(find_replay(folder))
-    assert (log.task, log.driver) == ("track_circle", "learned")
+    assert (log.task, log.policy) == ("track_circle", "learned")
     assert len(log.time_s) > 100
     assert surgisoft(["train", "--resume", str(folder)]) == 0
 

@@ -44,7 +44,7 @@ def recorded(name: str, steps: int, seed: int = 4):
     with torch.inference_mode():
         play = Episodes(task, donate=True)
         state = play.seeded(seed, 1)
-        recorder = EpisodeRecorder(task, state, driver="scripted", seed=seed)
+        recorder = EpisodeRecorder(task, state, policy="scripted", seed=seed)
         for _ in range(steps):
             actions = task.script(state)
             state, outcome = play.step(state, actions)

@@ -126,7 +126,7 @@ def test_the_expert_cuts_the_ring_while_it_moves(task, cut):
 def test_a_log_holds_the_motion_and_shows_the_cut_on_the_organ(task, cut, tmp_path):
     """Ends of the beam lie on the ring of the organ at rest; in space they do not."""
     states, outcomes = cut
-    recorder = EpisodeRecorder(task, states[0], driver="scripted", seed=0)
+    recorder = EpisodeRecorder(task, states[0], policy="scripted", seed=0)
     for state, outcome in zip(states[1:], outcomes, strict=True):
         recorder.step(state, outcome, {})
     save_episode(recorder.log(), tmp_path / "episode.npz")

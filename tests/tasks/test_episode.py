@@ -28,7 +28,7 @@ def cut():
     with torch.inference_mode():
         play = Episodes(task, donate=True)
         state = play.seeded(5, 2)
-        recorder = EpisodeRecorder(task, state, 1, driver="scripted", seed=5)
+        recorder = EpisodeRecorder(task, state, 1, policy="scripted", seed=5)
         kept = [(state.world.arms["laser"].tip_mm[1].clone(), None, None)]
         for _ in range(STEPS):
             actions = task.script(state)
@@ -110,7 +110,7 @@ def test_the_recorder_follows_its_episode_in_a_batch_that_shrinks():
     with torch.inference_mode():
         play = Episodes(task)
         three, alone = play.seeded(7, 3), play.seeded(7, 1, 2)
-        about = {"driver": "still", "seed": 7, "episode": 2}
+        about = {"policy": "still", "seed": 7, "episode": 2}
         first = EpisodeRecorder(task, three, 2, **about)
         second = EpisodeRecorder(task, alone, 0, **about)
         for count in (3, 2, 1):
@@ -137,7 +137,7 @@ def test_each_episode_has_the_ring_of_its_own_lesion():
     task = make_task("circle_ablation", CircleAblationConfig(world=WorldConfig(randomisation=vary)))
     with torch.inference_mode():
         state = Episodes(task).seeded(1, 8)
-        logs = [EpisodeRecorder(task, state, i, driver="none", seed=1).log() for i in range(8)]
+        logs = [EpisodeRecorder(task, state, i, policy="none", seed=1).log() for i in range(8)]
     starts = {tuple(log.path_mm[0].round(3)) for log in logs}
     assert len(starts) == 3
     for log in logs:
@@ -154,7 +154,7 @@ def test_steps_after_the_end_are_left_out():
     with torch.inference_mode():
         play = Episodes(task)
         state = play.seeded(0, 1)
-        recorder = EpisodeRecorder(task, state, driver="still", seed=0)
+        recorder = EpisodeRecorder(task, state, policy="still", seed=0)
         for _ in range(task.steps + 3):
             actions = {"arm": torch.zeros(1, 3)}
             state, outcome = play.step(state, actions)
@@ -183,7 +183,7 @@ def made_up(**series) -> EpisodeLog:
     log = EpisodeLog(
         task="t",
         agents=("arm",),
-        driver="d",
+        policy="d",
         on="rig",
         seed=1,
         episode=0,
@@ -276,7 +276,7 @@ def test_a_body_without_a_scene_is_in_the_log():
     with torch.inference_mode():
         play = Episodes(task)
         state = play.seeded(0, 1)
-        recorder = EpisodeRecorder(task, state, driver="still", seed=0)
+        recorder = EpisodeRecorder(task, state, policy="still", seed=0)
         for _ in range(2):
             actions = {"arm": torch.zeros(1, 3)}
             state, outcome = play.step(state, actions)

@@ -31,7 +31,7 @@ def members(tmp_path_factory):
     with torch.inference_mode():
         episodes = Episodes(task, donate=True)
         state = episodes.seeded(4, 1)
-        recorder = EpisodeRecorder(task, state, driver="scripted", seed=4)
+        recorder = EpisodeRecorder(task, state, policy="scripted", seed=4)
         for _ in range(3):
             actions = task.script(state)
             state, outcome = episodes.step(state, actions)
@@ -79,6 +79,7 @@ def test_an_episode_of_the_first_format_opens(members, tmp_path):
     table = json.loads(array(members["table.npy"]).tobytes())
     log = table["log"]["table"]
     table["format"] = "surgisoft episode 1"
+    log["driver"] = log.pop("policy")
     for arm in log["arms"]["table"].values():
         del arm["table"]["tool"]
     log["beam"] = log.pop("beams")["table"]["laser"]
@@ -94,6 +95,20 @@ def test_an_episode_of_the_first_format_opens(members, tmp_path):
     np.testing.assert_array_equal(old.beams["laser"].end_mm, new.beams["laser"].end_mm)
     np.testing.assert_array_equal(old.view_fraction, new.views["endoscope"])
     assert old.cameras["endoscope"].fov_rad == new.camera.fov_rad
+    assert old.policy == new.policy == "scripted"
+
+
+def test_an_episode_of_the_second_format_opens(members, tmp_path):
+    """The former table: `driver` in place of `policy`."""
+    table = json.loads(array(members["table.npy"]).tobytes())
+    table["format"] = "surgisoft episode 2"
+    table["log"]["table"]["driver"] = table["log"]["table"].pop("policy")
+    text = packed(np.frombuffer(json.dumps(table).encode(), np.uint8))
+    assert load_episode(written(tmp_path, members | {"table.npy": text})).policy == "scripted"
+    table["format"] = "surgisoft episode 3"
+    text = packed(np.frombuffer(json.dumps(table).encode(), np.uint8))
+    with pytest.raises(InputError, match="is not a complete episode"):
+        load_episode(written(tmp_path, members | {"table.npy": text}))
 
 
 DAMAGE = {
@@ -232,7 +247,7 @@ CONTRADICTIONS = {
     "holds infinite numbers": lambda log: with_first(
         log, "beams", power_w=np.full(len(log.time_s), np.inf)
     ),
-    "'driver' of the log is not a text": lambda log: replace(log, driver=1),
+    "'policy' of the log is not a text": lambda log: replace(log, policy=1),
     "'seed' of the log is not an integer": lambda log: replace(log, seed=1.5),
     "the camera's range is not a pair of numbers": lambda log: with_first(
         log, "cameras", range_mm=(1.0,)

@@ -79,7 +79,7 @@ SHAPES: dict[type, dict[str, tuple[Shape, str]]] = {
 """Shape and kind (floating point, integer, truth value) of every array of a log and its parts."""
 
 TEXTS = {
-    EpisodeLog: ("task", "driver", "on"),
+    EpisodeLog: ("task", "policy", "on"),
     ArmLog: ("tool",),
     DoseLog: ("body",),
     BodyLog: ("name", "role"),

@@ -29,10 +29,12 @@ _HEADERS: dict[tuple[int, int], Any] = {
 }
 SUFFIX = ".npz"
 """Suffix of the file of an episode."""
-FORMAT = "surgisoft episode 2"
+FORMAT = "surgisoft episode 3"
 """Name and version of the file format."""
+SECOND_FORMAT = "surgisoft episode 2"
+"""Former format, in which the name of the policy is `driver`."""
 FIRST_FORMAT = "surgisoft episode 1"
-"""Former format, of one laser named `laser` and one endoscope named `endoscope`."""
+"""Format before that, of one laser named `laser` and one endoscope named `endoscope`."""
 
 
 def save_episode(log: EpisodeLog, path: str | Path) -> None:
@@ -63,10 +65,11 @@ def load_episode(path: str | Path) -> EpisodeLog:
         raise InputError(f"{path}: cannot be read as .npz ({error}); {wanted}") from None
     try:
         table = json.loads(arrays.pop("table").tobytes())
-        if table["format"] not in (FORMAT, FIRST_FORMAT):
-            raise InputError(f"{path}: format {describe(table['format'])}, expected '{FORMAT}'")
+        version = table["format"]
+        if version not in (FORMAT, SECOND_FORMAT, FIRST_FORMAT):
+            raise InputError(f"{path}: format {describe(version)}, expected '{FORMAT}'")
         joined = _joined(table["log"], arrays)
-        log = _log(_present(joined) if table["format"] == FIRST_FORMAT else joined)
+        log = _log(_present(joined, version))
     except InputError:
         raise
     except (AttributeError, KeyError, TypeError, ValueError, RecursionError):
@@ -135,8 +138,12 @@ def _joined(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     return value
 
 
-def _present(table: dict[str, Any]) -> dict[str, Any]:
-    """The table of a log of the former format as one of the present format."""
+def _present(table: dict[str, Any], version: str) -> dict[str, Any]:
+    """The table of a log of any format as one of the present format."""
+    if version in (SECOND_FORMAT, FIRST_FORMAT):
+        table["policy"] = table.pop("driver")
+    if version != FIRST_FORMAT:
+        return table
     beam, camera, view = (table.pop(name) for name in ("beam", "camera", "view_fraction"))
     table["beams"] = {} if beam is None else {"laser": beam}
     table["cameras"] = {} if camera is None else {"endoscope": camera}

@@ -37,7 +37,7 @@ class EpisodeLog:
     """Name of the task in the registry."""
     agents: tuple[str, ...]
     """Names of the arms that acted."""
-    driver: str
+    policy: str
     """Name of the policy: `scripted`, `random`, or that of a learned one."""
     on: str
     """`simulation` or `rig`."""
@@ -173,7 +173,7 @@ class EpisodeRecorder:
         state: TaskState,
         environment: int = 0,
         *,
-        driver: str,
+        policy: str,
         seed: int,
         episode: int | None = None,
         on: str = "simulation",
@@ -183,7 +183,7 @@ class EpisodeRecorder:
         Without `episode` they are the same.
         """
         self.task, self.done, self.environment = task, False, environment
-        self._about: dict[str, Any] = {"driver": driver, "seed": int(seed), "on": on}
+        self._about: dict[str, Any] = {"policy": policy, "seed": int(seed), "on": on}
         self._about["episode"] = environment if episode is None else int(episode)
         self._rows: list[dict[str, np.ndarray]] = []
         self._dose: list[tuple[np.ndarray, np.ndarray]] = []
@@ -399,7 +399,7 @@ def find_events(log: EpisodeLog, ending: str = "") -> tuple[Event, ...]:
     it was still running.
     """
     found: list[Event] = []
-    found.append(Event(0.0, "info", f"{log.task} by {log.driver} in {log.on}, seed {log.seed}"))
+    found.append(Event(0.0, "info", f"{log.task} by {log.policy} in {log.on}, seed {log.seed}"))
     for name, beam in log.beams.items():
         whose = f" of {name}" if len(log.beams) > 1 else ""
         words = ("info", f"beam{whose} on"), ("info", f"beam{whose} off")

@@ -285,7 +285,7 @@ def kinds(some: Sequence[Judged]) -> str:
         if said in NAMING:
             said += "" if one.right else " (wrong)"
         table.setdefault(label, Counter())[said] += 1
-    lines = ["| true | said (times) |", "|---|---|"]
+    lines = ["| true | result (times) |", "|---|---|"]
     for label in sorted(table):
         said = ", ".join(f"{name} {count}" for name, count in table[label].most_common())
         lines.append(f"| {label.replace('_', ' ')} | {said} |")
@@ -317,7 +317,7 @@ def label_of(case: Labelled) -> str:
 
 
 def neighbours(some: Sequence[Judged]) -> str:
-    """What was said where the missing effect was no candidate, by that effect."""
+    """Results of cases in which the missing effect was no candidate, by that effect."""
     table: dict[str, list[Judged]] = {}
     for one in some:
         if len(one.case.left_out) == 1:
@@ -443,7 +443,7 @@ def markdown(
     parts = ["## Cases", sources([*cases, *aside])]
     if columns:
         parts += ["## Each source left out of the fit", goals(columns)]
-        parts += ["### What was said", kinds(together)]
+        parts += ["### Results by true effect", kinds(together)]
         parts += ["### Reliability", reliability(together)]
         parts += ["### Wrong names with a confidence of 0.8 or more", serious(together)]
         if any(case.left_out for case in cases):
@@ -459,11 +459,11 @@ def markdown(
                 new[f"{name}, fitted without {kin}"] = judged(own, models[kin])
         parts += ["## Unseen robots", goals(new)]
         for name, some in new.items():
-            parts += [f"### What was said, {name}", kinds(some)]
+            parts += [f"### Results by true effect, {name}", kinds(some)]
     if each_robot:
         inside = robots_left_out(cases)
         parts += ["## Each robot left out of the fit", goals({"all sources": inside})]
-        parts += ["### What was said, robots left out", kinds(inside)]
+        parts += ["### Results by true effect, robots left out", kinds(inside)]
     parts += ["## The fitted weights", weights(values), curves(values)]
     return "\n\n".join(parts) + "\n"
 

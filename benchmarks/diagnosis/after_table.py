@@ -149,7 +149,7 @@ def experiments(outcomes: list[Outcome]) -> str:
     if not asked:
         return ""
     lines = [
-        "| hidden | rivals | experiment | min | expected | said | bench untouched |",
+        "| hidden | competing | experiment | min | expected | result | bench untouched |",
         "|---|---|---|---|---|---|---|",
     ]
     for o in asked:
@@ -183,7 +183,7 @@ def amendments(outcomes: list[Outcome]) -> str:
         what = ", ".join(f"{effect} {count}" for effect, count in by.most_common())
         lines.append(f"| {name} | {what} | {numbers} | {100 * pooled_share(some):.0f} % |")
     note = (
-        "Errors in mm on the locked quarter. Oracle: the same model on the same robot with nothing "
-        "hidden, re-tuned where that pays. Share: of the oracle's fall."
+        "Errors in mm on the held-out quarter. Oracle: the same model on the same robot with "
+        "nothing hidden, re-tuned where that pays. Share: of the oracle's fall."
     )
     return f"## Amendments\n\n{note}\n\n" + "\n".join(lines)

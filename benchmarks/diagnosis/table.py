@@ -185,7 +185,7 @@ def _confusion(outcomes: list[Outcome]) -> str:
         said = o.effects[0] if o.effects else o.kind
         said += " ?" if o.kind == "ambiguous" else ""
         table.setdefault(hidden, Counter())[said] += 1
-    lines = ["| hidden | said (times) |", "|---|---|"]
+    lines = ["| hidden | result (times) |", "|---|---|"]
     for hidden in sorted(table):
         said = ", ".join(f"{name} {count}" for name, count in table[hidden].most_common())
         lines.append(f"| {hidden} | {said} |")

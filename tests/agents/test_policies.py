@@ -28,11 +28,11 @@ def task():
 
 
 def test_random_actions_do_not_depend_on_the_rest_of_the_batch(task):
-    driver, state = open_policy("random", task), Episodes(task).seeded(5, 4)
-    together = driver.act(task, state, {})["arm"]
+    policy, state = open_policy("random", task), Episodes(task).seeded(5, 4)
+    together = policy.act(task, state, {})["arm"]
     for i in range(4):
         one = rows(state, torch.tensor([i]))
-        assert torch.equal(driver.act(task, one, {})["arm"][0], together[i])
+        assert torch.equal(policy.act(task, one, {})["arm"][0], together[i])
 
 
 def test_scripted_is_the_expert_of_the_task(task):
@@ -43,11 +43,11 @@ def test_scripted_is_the_expert_of_the_task(task):
 
 
 def test_random_fills_the_pumps_range_evenly_and_anew_each_step(task):
-    play, driver = Episodes(task), Random(3)
+    play, policy = Episodes(task), Random(3)
     state = play.seeded(0, 2000)
-    first = driver.act(task, state, {})["arm"]
+    first = policy.act(task, state, {})["arm"]
     state, _ = play.step(state, {"arm": first})
-    second = driver.act(task, state, {})["arm"]
+    second = policy.act(task, state, {})["arm"]
     limit = task.world.arms["arm"].pneumatics.step_kPa
     for draw in (first, second):
         assert draw.abs().max() <= limit

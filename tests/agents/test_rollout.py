@@ -1,4 +1,4 @@
-"""Episodes played by drivers: what is kept of them, held against playing by hand."""
+"""Rollouts: what they keep of an episode is compared with steps taken by hand."""
 
 import math
 from dataclasses import replace
@@ -49,14 +49,14 @@ def test_the_size_of_a_batch_changes_nothing(task):
 
 
 def test_statistics_are_those_of_an_episode_played_by_hand(task):
-    play, driver = Episodes(task), Random()
+    play, policy = Episodes(task), Random()
     state, errors, total = play.seeded(9, 3), [], 0.0
     for _ in range(task.steps):
-        state, outcome = play.step(state, driver.act(task, state, play.observe(state)))
+        state, outcome = play.step(state, policy.act(task, state, play.observe(state)))
         errors.append(outcome.measures["error_mm"])
         total = total + outcome.rewards["arm"]
     seen = torch.stack(errors, 1).numpy()
-    found = rollout(task, driver, 3, seed=9)
+    found = rollout(task, policy, 3, seed=9)
     torch.testing.assert_close(found.returns["arm"], total)
     for name, expected in {
         "mean": np.nanmean(seen, 1),

@@ -79,7 +79,7 @@ def test_what_is_claimed(before, after, ci95, claimed):
 
 
 def test_the_locked_rows_take_no_part():
-    """Wild key points in the locked part change its error, and no parameter."""
+    """Wild key points in the held-out part change its error, and no parameter."""
     recording = measured_on(TRUTHS["gain_mismatch"], rows=200)
     points = recording.key_points_mm.copy()
     points[held_out_rows([recording])] += 5.0

@@ -159,8 +159,8 @@ def test_hysteresis_that_the_model_has_is_fitted_anew_not_doubled():
     fitted = fit_effects(problem, ["hysteresis"])
     assert list(fitted.model.effects) == ["hysteresis"]
     assert fitted.refitted == ("hysteresis",)
-    locked = problem_of(weaker, [recording], part="held_out")
-    before, after = rms(locked.residual), rms(locked.with_model(fitted.model).residual)
+    held_out = problem_of(weaker, [recording], part="held_out")
+    before, after = rms(held_out.residual), rms(held_out.with_model(fitted.model).residual)
     assert before > 2 * np.sqrt(3) * NOISE_MM
     assert after < 1.1 * np.sqrt(3) * NOISE_MM
     assert torch.equal(
@@ -199,9 +199,9 @@ def test_a_network_is_retuned_only_where_held_out_motion_rewards_it():
     off.network.layers[-1].bias += 0.02
     found = retune(off, problem_of(off, [recording], part="training"))
     assert found.kept
-    locked = problem_of(off, [recording], part="held_out")
-    after = locked.with_model(found.model)
-    assert rms(after.residual) < 1.1 * np.sqrt(3) * NOISE_MM < 0.7 * rms(locked.residual)
+    held_out = problem_of(off, [recording], part="held_out")
+    after = held_out.with_model(found.model)
+    assert rms(after.residual) < 1.1 * np.sqrt(3) * NOISE_MM < 0.7 * rms(held_out.residual)
 
 
 def test_a_recurrent_baseline_takes_no_effects():

@@ -1,4 +1,4 @@
-"""Rivals at fitted shapes: a lag that no grid holds, in an arm whose wall remembers."""
+"""Competing effects with fitted parameters: a lag between grid points, and hysteresis."""
 
 import itertools
 
@@ -73,12 +73,12 @@ def test_a_lag_before_the_plays_is_no_viscosity_behind_them(lagging, monkeypatch
 
 def test_what_is_fitted_is_plausible_small_and_new(lagging):
     problem = problem_of(default_arm(), [lagging], part="training")
-    race = ModelSelection.of(
+    selection = ModelSelection.of(
         problem, candidates(problem, ["line_lag", "hysteresis", "rate_dependence"])
     )
-    first = race.scores()
-    assert {standing.effect for standing in first} >= {"line_lag", "hysteresis"}
-    fitted = refined(problem, race.starts(first))
+    first = selection.scores()
+    assert {score.effect for score in first} >= {"line_lag", "hysteresis"}
+    fitted = refined(problem, selection.starts(first))
     names = [candidate.name for candidate in fitted]
     assert "line_lag" in names
     assert "hysteresis" not in names  # the model has it already
@@ -91,12 +91,12 @@ def test_what_is_fitted_is_plausible_small_and_new(lagging):
 
 def test_a_fit_leaves_the_shapes_of_the_grid_as_they_are(lagging):
     problem = problem_of(default_arm(), [lagging], part="training")
-    race = ModelSelection.of(problem, candidates(problem, ["line_lag"]))
-    standing = race.scores()[0]
-    effect = race.in_place(standing.option)
+    selection = ModelSelection.of(problem, candidates(problem, ["line_lag"]))
+    score = selection.scores()[0]
+    effect = selection.in_place(score.option)
     before = {name: p.detach().clone() for name, p in effect.named_parameters()}
-    assert refined(problem, race.starts([standing]))
-    after = dict(race.in_place(standing.option).named_parameters())
+    assert refined(problem, selection.starts([score]))
+    after = dict(selection.in_place(score.option).named_parameters())
     assert all(after[name].equal(value) for name, value in before.items())
 
 
@@ -117,7 +117,10 @@ def test_loops_do_not_stand_for_what_the_actuation_explains():
     behind = np.stack([backlash(column, 1.0) for column in commands.T], axis=1)
     for pressure, allowed in ((0.94 * commands, False), (behind, True)):
         problem = problem_of(default_arm(), [made(commands, pressure)])
-        race = ModelSelection.of(problem, candidates(problem, ["hysteresis"]))
-        best = min(race.options["hysteresis"], key=lambda way: race.losses(way.chosen).sum())
-        assert race.losses(best.chosen).sum() < 0.2 * race.losses().sum()
-        assert race.plausible(best) == allowed
+        selection = ModelSelection.of(problem, candidates(problem, ["hysteresis"]))
+        best = min(
+            selection.options["hysteresis"],
+            key=lambda option: selection.losses(option.chosen).sum(),
+        )
+        assert selection.losses(best.chosen).sum() < 0.2 * selection.losses().sum()
+        assert selection.plausible(best) == allowed

@@ -94,7 +94,7 @@ def test_copies_are_left_out_of_a_fit_together():
     assert len(set(folds(np.zeros(12, int)))) >= 2
 
 
-def test_six_motions_are_six_witnesses_however_often_they_come():
+def test_repetitions_of_six_motions_count_as_six_independent_samples():
     """Gains of one sign in six motions: one in 2^6 by chance, not one in 2^96 for their copies."""
     rows = sweep(1.0, 16)
     problem = problem_of(still_model(), [recording(0 * rows[:, 0], rows)], part="training")

@@ -23,7 +23,7 @@ LOSS = {"": 100, "0": 40, "1": 55, "2": 50, "01": 20, "02": 18, "12": 2, "012": 
 
 @dataclass
 class Table:
-    """A race whose losses are those of LOSS, spread over blocks."""
+    """A model selection whose losses are those of LOSS, spread over blocks."""
 
     floor = np.full(40, 1.0 / 40)
     whole_size = 3.0
@@ -58,11 +58,11 @@ class Table:
 
 @pytest.fixture
 def table(monkeypatch):
-    race = Table()
-    nothing = RelaxedFit(race.losses(), 0.0, 0.0, 1.0)
-    monkeypatch.setattr(selection, "beside_relaxed", lambda race, named, further: further)
-    monkeypatch.setattr(selection, "relaxed_fit", lambda race, named: nothing)
-    return race
+    table = Table()
+    nothing = RelaxedFit(table.losses(), 0.0, 0.0, 1.0)
+    monkeypatch.setattr(selection, "beside_relaxed", lambda table, named, further: further)
+    monkeypatch.setattr(selection, "relaxed_fit", lambda table, named: nothing)
+    return table
 
 
 def test_the_best_alone_gives_way_to_the_two_that_are_best_together(table):

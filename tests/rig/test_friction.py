@@ -12,7 +12,7 @@ strains = st.floats(-0.15, 0.3)
 
 
 class Line:
-    """One wall line through its strains."""
+    """One wall fibre through its strains."""
 
     def __init__(self):
         self.last, self.depth, self.stack = rested(1)

@@ -74,7 +74,7 @@ def test_the_geometry_asked_for_decides(geometry, monkeypatch):
     """Every clearance and hit of an episode is an answer of that engine, and of no other."""
     env = surgisoft.parallel_env("circle_ablation", geometry=geometry)
     around, asked = env.task.scene, []
-    referee = CollisionChecker(around.geometry.bodies)
+    checker = CollisionChecker(around.geometry.bodies)
     assert isinstance(around.collision, ExactScene if geometry == "fcl" else BatchedScene)
     ask = around.collision.clearance
     monkeypatch.setattr(
@@ -92,7 +92,7 @@ def test_the_geometry_asked_for_decides(geometry, monkeypatch):
     assert asked.count("clearance") == 3
     arms, scene = env.task_state.world.arms, env.task_state.world.scene
     shapes = {name: ArmShape(part.line_mm[0].numpy(), 7.5) for name, part in arms.items()}
-    exact = referee.clearance(shapes).least_mm
+    exact = checker.clearance(shapes).least_mm
     near = {"fcl": 1e-4, "batched": 0.5}[geometry]
     assert scene.clearance.least_mm.item() == pytest.approx(exact, abs=near)
 

@@ -1,4 +1,4 @@
-"""The two-arm task: the scripted solver cuts the ring; each part of the interlock holds."""
+"""The two-arm task: the scripted expert cuts the ring; each part of the interlock holds."""
 
 import math
 from dataclasses import replace

@@ -49,14 +49,14 @@ def test_the_script_visits_every_slot_without_contact(done):
 
 
 def test_fcl_agrees(task, done):
-    """The referee on every fifth body of the episodes: no contact, the same clearances."""
-    referee = CollisionChecker(task.world.scene.geometry.bodies)
+    """The exact checker on every fifth body of the episodes: no contact, the same clearances."""
+    checker = CollisionChecker(task.world.scene.geometry.bodies)
     for state in done[0][::5]:
         for i, line in enumerate(state.world.arms["arm"].line_mm.numpy()):
             shape = {"arm": ArmShape(line, 7.5)}
-            assert not referee.collisions(shape)
+            assert not checker.collisions(shape)
             said = state.world.scene.clearance.least_mm[i].item()
-            assert referee.clearance(shape).least_mm == pytest.approx(said, abs=0.1)
+            assert checker.clearance(shape).least_mm == pytest.approx(said, abs=0.1)
 
 
 def test_the_straight_line_to_the_next_slot_hits_the_plate(task):

@@ -162,13 +162,13 @@ def test_geometry_is_the_referees(theatre, phantom):
     state = theatre.start(streams(7, 6))
     for action in actions_of(theatre, 6, 10, seed=2):
         state = theatre.step(state, action)
-    referee, scene = CollisionChecker(phantom.bodies), state.scene
+    checker, scene = CollisionChecker(phantom.bodies), state.scene
     for i in range(6):
         shapes = {name: ArmShape(part.line_mm[i].numpy(), 7.5) for name, part in state.arms.items()}
-        least = referee.clearance(shapes).least_mm
+        least = checker.clearance(shapes).least_mm
         assert scene.clearance.least_mm[i].item() == pytest.approx(least, abs=0.3)
         laser = state.arms["laser"]
-        hit = referee.cast(
+        hit = checker.cast(
             laser.tip_mm[i].numpy(), laser.tip_direction[i].numpy(), 110.0, shapes, own="laser"
         )
         assert int(hit.struck) == scene.hit.struck[i].item()

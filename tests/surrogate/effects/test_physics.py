@@ -149,7 +149,7 @@ def test_softening_leaves_the_first_loading_and_softens_the_second():
     assert float(answer[-1]) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_softening_of_wall_lines_that_the_other_chambers_shorten():
+def test_softening_of_wall_fibres_that_the_other_chambers_shorten():
     soft = make_effect("softening", RANGE, width=0.2, growth=0.1, others=-0.5)
     answer = run(with_strength(soft, own=0.2), [[1.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
     # Lines see (2, -1, -1) / 3, then half of that.
@@ -160,7 +160,7 @@ def test_softening_of_wall_lines_that_the_other_chambers_shorten():
     assert torch.allclose(answer[1], torch.tensor([0.5, 0.0, 0.0]) + 0.2 * pushed, atol=1e-5)
 
 
-def test_stiffening_of_wall_lines_that_the_other_chambers_shorten():
+def test_stiffening_of_wall_fibres_that_the_other_chambers_shorten():
     stiff = make_effect("stiffening", RANGE, steepness=0.001, others=-0.5)
     answer = run(with_strength(stiff, own=0.1), [[1.0, 1.0, 0.0]])
     # Lines see (1, 1, -2) / 3 and resist by their cubes.

@@ -1,4 +1,4 @@
-"""Wall lines: which loads they carry."""
+"""Wall fibres: which loads they carry."""
 
 import math
 

@@ -119,8 +119,8 @@ COMPARE = {
     "floor_mm": ("floor_mm",),
     "floor_source": ("floor_source",),
     "floors_mm": ("floors",),
-    "ceiling_mm": ("ceiling_mm",),
-    "ceiling_ci95_mm": ("ceiling_ci95_mm",),
+    "ceiling_mm": ("ceiling_mm", "best_achievable_mm"),
+    "ceiling_ci95_mm": ("ceiling_ci95_mm", "best_achievable_ci95_mm"),
     "explainable": ("explainable",),
     "axis_share": ("axes[axis].share",),
     "axis_ci95": ("axes[axis].ci95",),
@@ -144,7 +144,7 @@ DIAGNOSE = {
     "effects": ("verdict.effects",),
     "before_mm": ("error_mm.before",),
     "floor_mm": ("error_mm.floor",),
-    "ceiling_mm": ("error_mm.ceiling",),
+    "ceiling_mm": ("error_mm.ceiling", "error_mm.best_achievable"),
     "ranking": ("ranking[].effect",),
     "confidence": ("ranking[effect].confidence",),
     "gain_alone": ("ranking[effect].gain_alone",),
@@ -172,14 +172,14 @@ AMEND = {
 AMEND_ONLY = {
     "refitted": ("refitted",),
     "effects_alone_after_mm": ("error_effects_alone_mm.after",),
-    "open_before_mm": ("error_open_mm.before",),
-    "open_after_mm": ("error_open_mm.after",),
+    "open_before_mm": ("error_open_mm.before", "error_training_mm.before"),
+    "open_after_mm": ("error_open_mm.after", "error_training_mm.after"),
 }
 
 IMPROVE_ONLY = {
     "verdicts": ("rounds[].verdict",),
     "steps": ("rounds[].step",),
-    "rounds_open_mm": ("rounds[].error_open_mm",),
+    "rounds_open_mm": ("rounds[].error_open_mm", "rounds[].error_training_mm"),
     "rounds_mm": ("rounds[].error_mm",),
 }
 
@@ -200,9 +200,9 @@ EVALUATE = {
     "task": ("task",),
     "episodes": ("episodes",),
     "dt_s": ("dt_s",),
-    "overall": ("drivers.*.overall",),
-    "per_episode": ("drivers.*.per_episode",),
-    "referee": ("drivers.*.referee", None),
+    "overall": ("drivers.*.overall", "policies.*.overall"),
+    "per_episode": ("drivers.*.per_episode", "policies.*.per_episode"),
+    "referee": ("drivers.*.referee", "policies.*.exact_checks", None),
 }
 """Recorded name -> where `evaluate --json` has it; None: it may be absent, without a scene."""
 

@@ -11,7 +11,7 @@ import math
 import os
 import secrets
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
@@ -134,6 +134,11 @@ def json_safe(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [json_safe(part) for part in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def with_former_keys(values: dict[str, Any], former: Mapping[str, str]) -> dict[str, Any]:
+    """The values under the deprecated names of some keys, too; former: old name -> present name."""
+    return values | {old: values[new] for old, new in former.items()}
 
 
 def _beside(path: Path) -> Path:

@@ -121,7 +121,7 @@ def test_train_and_evaluate_give_what_the_commands_write(tmp_path, monkeypatch):
     again = "train --task track_circle -o theirs --steps 64 --envs 8 --seed 5"
     assert run(again.split()) == 0
     found = surgisoft.evaluate(["mine", "theirs", "scripted"], episodes=2, seed=1)
-    mine, theirs, scripted = found.to_json()["drivers"].values()
+    mine, theirs, scripted = found.to_json()["policies"].values()
     assert mine["overall"] == theirs["overall"] != scripted["overall"]
     command = "evaluate mine theirs scripted --episodes 2 --seed 1 --json out.json"
     assert run(command.split()) == 0

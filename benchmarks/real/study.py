@@ -187,7 +187,7 @@ def answer_of(model: ArmModel, found: Diagnosis, seconds: float) -> Answer:
         sentence=verdict.sentence,
         before_mm=found.error_mm.before,
         floor_mm=found.error_mm.floor,
-        best_mm=found.error_mm.ceiling,
+        best_mm=found.error_mm.best_achievable,
         validated_mm=model.validation.rmse_mm,
         seconds=seconds,
         faults=found.setup.kinds if found.setup else (),

@@ -14,7 +14,7 @@ from torch import Tensor
 from surgisoft.agents.exact_checks import EpisodeCheck, ExactChecks, contacts_in, has_obstacles
 from surgisoft.agents.policies import Policy
 from surgisoft.agents.rollout import BATCH, Instant, Rollout, rollout
-from surgisoft.files import json_safe
+from surgisoft.files import json_safe, with_former_keys
 from surgisoft.progress import Progress, silent
 from surgisoft.tasks.base import Task
 from surgisoft.tasks.world.scene import SceneEngine
@@ -77,7 +77,7 @@ class Evaluation:
             },
         }
         if self.checks is not None:
-            document["referee"] = {
+            document["exact_checks"] = {
                 "instants": sum(v.steps for v in self.checks),
                 "contact_differs": sum(v.contact_differs for v in self.checks),
                 "beam_differs": sum(v.beam_differs for v in self.checks),
@@ -88,6 +88,7 @@ class Evaluation:
                 "beams_asked": sum(v.beams_asked for v in self.checks),
                 "contacts": [_contact(v) for v in self.checks],
             }
+            return with_former_keys(document, {"referee": "exact_checks"})
         return document
 
 

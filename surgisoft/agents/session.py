@@ -18,6 +18,7 @@ from surgisoft.agents.rollout import BATCH, EpisodeRecorders
 from surgisoft.agents.run_folder import RunFolder
 from surgisoft.config import to_table
 from surgisoft.errors import InputError
+from surgisoft.files import with_former_keys
 from surgisoft.progress import Progress, silent
 from surgisoft.scene.folder import Scene, open_scene
 from surgisoft.tasks.base import Episodes, Task
@@ -171,7 +172,7 @@ class Evaluations:
     def to_json(self) -> dict:
         """Plain values, as `evaluate --json` writes them."""
         asked = self.request
-        return {
+        values = {
             "task": self.task,
             "task_config": self.task_config,
             "on": asked.place,
@@ -182,11 +183,12 @@ class Evaluations:
             "episodes": asked.episodes,
             "dt_s": self.dt_s,
             "confidence": CONFIDENCE,
-            "drivers": {
+            "policies": {
                 name: result.to_json()
                 for name, result in zip(asked.policies, self.results, strict=True)
             },
         }
+        return with_former_keys(values, {"drivers": "policies"})
 
 
 def evaluate(

@@ -190,7 +190,7 @@ def _show(found) -> None:
         return
     print(
         f"error {error.before:.4f} mm, floor {error.floor:.4f} mm, "
-        f"best achievable {error.ceiling:.4f} mm (on {found.left_out})"
+        f"best achievable {error.best_achievable:.4f} mm (on {found.left_out})"
     )
     for check in found.checks:
         print(f"check: {check}")

@@ -106,7 +106,7 @@ def evaluate(
     report: Report = None,
 ) -> None:
     """Evaluate policies on the same episodes of a task, with 95 % intervals."""
-    check_free(json_file, "drivers")
+    check_free(json_file, "policies", "drivers")
     check_replay(replay)
     check_folder(report)
     on = on or (PLACES[1] if rig else PLACES[0])
@@ -236,7 +236,7 @@ def _show(results) -> None:
         print(f"{first:{widths[0]}s}{held}")
     for result in results:
         if result.checks is not None:
-            facts = result.to_json()["referee"]
+            facts = result.to_json()["exact_checks"]
             print(
                 f"exact collision checker on {Path(result.policy).name}: of "
                 f"{counted(facts['instants'], 'instant')} the batched geometry differs on contact "

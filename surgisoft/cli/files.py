@@ -10,10 +10,10 @@ from surgisoft.errors import InputError
 from surgisoft.files import read_json
 
 
-def check_free(path: Path | None, field: str) -> None:
+def check_free(path: Path | None, *keys: str) -> None:
     """Raise InputError unless a JSON file may be written: new, or an older result of its kind.
 
-    An older result has the named field.
+    An older result has one of the keys.
     """
     if path is None:
         return
@@ -22,7 +22,7 @@ def check_free(path: Path | None, field: str) -> None:
         return
     try:
         old = read_json(path)
-        same = isinstance(old, dict) and field in old
+        same = isinstance(old, dict) and any(key in old for key in keys)
     except (OSError, ValueError):
         same = False
     if not same:

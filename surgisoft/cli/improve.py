@@ -116,9 +116,9 @@ def _show(result) -> None:
     for number, done in enumerate(result.rounds, 1):
         what = f"+ {done.step}" if done.step else "no further effect"
         what += ", fitted together with the network" if done.together else ""
-        rivals = f" (or {', '.join(done.rivals)})" if done.rivals else ""
+        competing = f" (or {', '.join(done.competing)})" if done.competing else ""
         print(f"round {number}: {done.verdict}: {done.sentence}")
-        print(f"  {what}{rivals}: error on the training part {done.error_open_mm:.4f} mm")
+        print(f"  {what}{competing}: error on the training part {done.error_training_mm:.4f} mm")
     if result.steps:
         show_parameters(result.parameters)
         fall = result.held_out

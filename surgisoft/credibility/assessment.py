@@ -26,7 +26,7 @@ from surgisoft.diagnosis.compare import Comparison
 from surgisoft.diagnosis.diagnose import Diagnosis, diagnose
 from surgisoft.diagnosis.residuals import ResidualTable
 from surgisoft.errors import InputError
-from surgisoft.files import json_safe
+from surgisoft.files import json_safe, with_former_keys
 from surgisoft.measurement.histories import actuation_of, history_of
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.arm import ArmSpec
@@ -196,12 +196,12 @@ class Assessment:
     def to_json(self) -> dict:
         """Plain values, as the JSON file has them."""
         context, found = self.context, self.diagnosis
-        return json_safe(
+        values = json_safe(
             {
                 "statement": STATEMENT,
                 "sentence": self.sentence,
                 "passed": self.passed,
-                "took_no_part": None
+                "held_out": None
                 if any(each.in_fit is None for each in self.comparators)
                 else not self.rows_of_fit,
                 "question_of_interest": context.question,
@@ -238,6 +238,7 @@ class Assessment:
                 "software": self.software,
             }
         )
+        return with_former_keys(values, {"took_no_part": "held_out"})
 
 
 @torch_threads(1)

@@ -26,6 +26,7 @@ from surgisoft.diagnosis.refit import refit as refit_effects
 from surgisoft.diagnosis.residuals import Problem, Sealed, residual_table
 from surgisoft.diagnosis.statistics import block_interval, block_sums
 from surgisoft.errors import InputError
+from surgisoft.files import with_former_keys
 from surgisoft.measurement.recordings import load_recordings
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
@@ -128,9 +129,10 @@ class Fall:
         )
 
     def to_json(self) -> dict:
-        """Plain values; `took_no_part`: whether the old model had been fitted to none of them."""
+        """Plain values; `held_out`: whether the old model had been fitted to none of them."""
         apart = None if self.in_fit is None else not self.in_fit
-        return asdict(self) | {"ci95": list(self.ci95), "took_no_part": apart}
+        values = asdict(self) | {"ci95": list(self.ci95), "held_out": apart}
+        return with_former_keys(values, {"took_no_part": "held_out"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,14 +248,14 @@ class Amendment:
     def to_json(self) -> dict:
         """Plain values, as `amend --json` writes them and as the new model's folder keeps them."""
         held_out, training = self.held_out, self.training
-        return {
+        values = {
             "effects": list(self.effects),
             "refitted": list(self.refitted),
             "claimed": self.claimed,
             "sentence": self.sentence,
             "error_mm": held_out.to_json(),
             "error_effects_alone_mm": self.alone.to_json(),
-            "error_open_mm": training.to_json(),
+            "error_training_mm": training.to_json(),
             "parameters": [parameter.to_json() for parameter in self.parameters],
             "network_retuned": self.retuned,
             "refit": None if self.refit is None else self.refit.to_json(),
@@ -262,6 +264,7 @@ class Amendment:
             "change": self.change and self.change.to_json(),
             "error_model_mm": self.model_error and self.model_error.to_json(),
         }
+        return with_former_keys(values, {"error_open_mm": "error_training_mm"})
 
 
 @torch_threads(1)

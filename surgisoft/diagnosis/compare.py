@@ -34,7 +34,7 @@ from surgisoft.diagnosis.setup import find_setup_faults
 from surgisoft.diagnosis.statistics import block_interval, block_sums
 from surgisoft.diagnosis.testability import testable
 from surgisoft.errors import InputError
-from surgisoft.files import json_safe
+from surgisoft.files import json_safe, with_former_keys
 from surgisoft.measurement.histories import check_fits
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.progress import Progress, silent
@@ -50,6 +50,12 @@ LEAST_ROWS = 60
 """Fewest measured rows from which shares and a best achievable error are computed."""
 AT_FLOOR = 1.05
 """An error below this multiple of the noise floor is at the floor."""
+FORMER_KEYS = {
+    "ceiling_mm": "best_achievable_mm",
+    "ceiling_ci95_mm": "best_achievable_ci95_mm",
+    "took_no_part": "held_out",
+}
+"""Deprecated keys of the JSON, each with its present name."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +104,7 @@ class Comparison:
     """The noise floor: what the lab states, else from holds, else from second differences."""
     floors: tuple[Floor, ...]
     """Every estimate of the floor that the recordings allow."""
-    ceiling: BestAchievable | None
+    best_achievable: BestAchievable | None
     """Best achievable error, the same that `diagnose` reports on the same rows: the least that the
     model, a black box, any effect or the selected effects leave on held-out blocks. None for too
     few rows."""
@@ -138,9 +144,9 @@ class Comparison:
         """
         noise = self.floor.rmse_mm or 0.0
         excess = self.rmse_mm**2 - noise**2
-        if self.ceiling is None or self.rmse_mm <= AT_FLOOR * noise or excess <= 0:
+        if self.best_achievable is None or self.rmse_mm <= AT_FLOOR * noise or excess <= 0:
             return None
-        return float(np.clip((self.rmse_mm**2 - self.ceiling.rmse_mm**2) / excess, 0, 1))
+        return float(np.clip((self.rmse_mm**2 - self.best_achievable.rmse_mm**2) / excess, 0, 1))
 
     @property
     def main_axes(self) -> list[AxisShare]:
@@ -160,9 +166,9 @@ class Comparison:
             text = f"{self.change.sentence}; {text}"
         if noise is not None and self.rmse_mm <= AT_FLOOR * noise:
             return f"{text}: the error is at the floor"
-        if self.ceiling is None:
+        if self.best_achievable is None:
             return f"{text}; too few rows to say what it depends on"
-        text += f", best achievable {_mm(self.ceiling.rmse_mm)}"
+        text += f", best achievable {_mm(self.best_achievable.rmse_mm)}"
         what = "error" if noise is None else "excess"
         text += f": {100 * (self.explainable or 0):.0f} % of the {what} is explainable"
         return f"{text}; {self._depends()}"
@@ -184,20 +190,20 @@ class Comparison:
         return text
 
     def to_json(self) -> dict:
-        """Plain values: `rmse_mm`, `per_key_point_mm`, `tip_rmse_mm`, `floor_mm` and the table."""
+        """Plain values, as `compare --json` writes them; see `FORMER_KEYS` for deprecated names."""
         values = asdict(self) | {"change": self.change and self.change.to_json()}
-        floor, top = values.pop("floor"), values.pop("ceiling")
+        floor, top = values.pop("floor"), values.pop("best_achievable")
         values |= {
             "sentence": self.sentence,
             "floor_mm": floor["rmse_mm"],
             "floor_source": floor["source"],
             "floors": {each.source: each.rmse_mm for each in self.floors},
-            "ceiling_mm": top and top["rmse_mm"],
-            "ceiling_ci95_mm": top and top["ci95_mm"],
+            "best_achievable_mm": top and top["rmse_mm"],
+            "best_achievable_ci95_mm": top and top["ci95_mm"],
             "explainable": self.explainable,
-            "took_no_part": None if self.in_fit is None else not self.in_fit,
+            "held_out": None if self.in_fit is None else not self.in_fit,
         }
-        return json_safe(values)
+        return json_safe(with_former_keys(values, FORMER_KEYS))
 
 
 @torch_threads(1)
@@ -272,7 +278,7 @@ def compare(
             mse_mm2=_nanmean(square) / 3,
             floor=table.floor,
             floors=_floors(problem),
-            ceiling=achievable(problem) if enough else None,
+            best_achievable=achievable(problem) if enough else None,
             axes=tuple(shares(problem)) if enough else (),
             time_shift=time_shift(table, block),
             samples=int(seen.sum()),

@@ -59,6 +59,7 @@ from surgisoft.diagnosis.selection import (
 from surgisoft.diagnosis.setup import SetupResult, find_setup_faults
 from surgisoft.diagnosis.testability import NotTestable, testable
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.files import with_former_keys
 from surgisoft.measurement.histories import check_fits
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.progress import Progress as RefitProgress
@@ -141,7 +142,7 @@ class ErrorLevels:
     """Error of the model as it is, on the training rows."""
     floor: float
     """The noise floor."""
-    ceiling: float
+    best_achievable: float
     """Best achievable error: the least that the model, a black box, any effect or the named effects
     leave on held-out blocks."""
 
@@ -231,6 +232,7 @@ class Diagnosis:
         """Plain values, as `diagnose --json` writes them."""
         plain = asdict(replace(self, setup=None, track=None, change=None, refit=None))
         del plain["track"]
+        plain["error_mm"] = with_former_keys(plain["error_mm"], {"ceiling": "best_achievable"})
         return plain | {
             "setup": self.setup.to_json() if self.setup else None,
             "change": self.change.to_json() if self.change else None,

@@ -20,6 +20,7 @@ from surgisoft.diagnosis.other_models import open_model, refuse_predictions
 from surgisoft.diagnosis.refit import JointFit, apart_mm, fit_together
 from surgisoft.diagnosis.residuals import Sealed, model_discrepancy, residual_table
 from surgisoft.errors import InputError
+from surgisoft.files import with_former_keys
 from surgisoft.measurement.recordings import Recording
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
@@ -39,6 +40,10 @@ NETWORK = "network"
 """Name of the step that re-tunes the network."""
 
 
+FORMER_KEYS = {"rivals": "competing", "error_open_mm": "error_training_mm"}
+"""Deprecated keys of the JSON of a round, each with its present name."""
+
+
 @dataclass(frozen=True, eq=False)
 class Round:
     """One round: the result of a diagnosis and what was done."""
@@ -49,16 +54,20 @@ class Round:
     """The verdict in words."""
     step: str | None
     """The effect that was added or fitted anew, or `network`; None where the loop ended."""
-    rivals: tuple[str, ...]
+    competing: tuple[str, ...]
     """Effects that would fit about as well."""
     confidence: float | None
     """Confidence in it, 0 to 1."""
-    error_open_mm: float
+    error_training_mm: float
     """RMS distance on the training rows after the round, mm."""
     error_mm: float | None = None
     """RMS distance on the held-out rows after the round, known when all rounds have ended, mm."""
     together: bool = False
     """Whether the effect was fitted together with the whole network."""
+
+    def to_json(self) -> dict:
+        """Plain values; see `FORMER_KEYS` for deprecated names."""
+        return with_former_keys(asdict(self) | {"competing": list(self.competing)}, FORMER_KEYS)
 
 
 Progress = Callable[[Round], None]
@@ -129,7 +138,7 @@ class Improvement:
             "effects": [name for name, _ in self.steps if name != NETWORK],
             "network_retuned": any(name == NETWORK for name, _ in self.steps),
             "error_mm": self.held_out.to_json(),
-            "rounds": [asdict(r) | {"rivals": list(r.rivals)} for r in self.rounds],
+            "rounds": [each.to_json() for each in self.rounds],
             "parameters": [parameter.to_json() for parameter in self.parameters],
             "notes": list(self.notes),
             "seconds": self.seconds,
@@ -315,8 +324,8 @@ def _idle(name: str, fall: Fall) -> str:
 
 def _step(current: Round, name: str, found: Diagnosis, error_mm: float) -> Round:
     """The round in which the named effect was added."""
-    rivals = found.verdict.effects[1:] if found.verdict.kind == "ambiguous" else ()
+    competing = found.verdict.effects[1:] if found.verdict.kind == "ambiguous" else ()
     sure = next((row.confidence for row in found.ranking if row.effect == name), None)
     return replace(
-        current, step=name, rivals=tuple(rivals), confidence=sure, error_open_mm=error_mm
+        current, step=name, competing=tuple(competing), confidence=sure, error_training_mm=error_mm
     )

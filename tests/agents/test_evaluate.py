@@ -127,10 +127,10 @@ def test_command_compares_policies_and_writes_all_numbers(tmp_path, capsys, shor
         "track_circle", "simulation", 4, 3,
     )  # fmt: skip
     assert found["task_config"]["follow"]["loop_s"] == 1.5
-    script, chance = found["drivers"]["scripted"], found["drivers"]["random"]
-    for driver in (script, chance):
-        errors = driver["per_episode"]["error_mean_mm"]
-        overall = driver["overall"]["error_mean_mm"]
+    script, chance = found["policies"]["scripted"], found["drivers"]["random"]
+    for policy in (script, chance):
+        errors = policy["per_episode"]["error_mean_mm"]
+        overall = policy["overall"]["error_mean_mm"]
         assert len(errors) == overall["episodes"] == 3
         assert overall["mean"] == pytest.approx(np.mean(errors))
         assert overall["low"] <= overall["mean"] <= overall["high"]
@@ -186,7 +186,7 @@ def test_a_run_brings_its_task_and_refuses_another(tmp_path, capsys, short):
     found = json.loads(file.read_text())
     assert found["task"] == "track_circle"
     assert found["task_config"]["follow"]["loop_s"] == 1.5
-    times = found["drivers"][folder]["per_episode"]["time_s"]
+    times = found["policies"][folder]["per_episode"]["time_s"]
     assert times == pytest.approx([2.0, 2.0])
 
 
@@ -200,7 +200,7 @@ def test_another_seed_gives_other_episodes(tmp_path):
         arguments = ["evaluate", "random", "--task", "track_circle", "--episodes", "2", *config]
         assert run([*arguments, *seed, "--json", str(file)]) == 0
         found = json.loads(file.read_text())
-        return found["seed"], found["drivers"]["random"]["per_episode"]["error_mean_mm"]
+        return found["seed"], found["policies"]["random"]["per_episode"]["error_mean_mm"]
 
     given = [
         errors(n, *s) for n, s in zip("abc", ([], ["--seed", "0"], ["--seed", "7"]), strict=True)

@@ -100,7 +100,7 @@ def test_evaluate_prints_a_column_for_each_policy(capsys, monkeypatch):
     }  # fmt: skip
     scripted = SimpleNamespace(
         policy="scripted", overall={"success": summary(0.5), "error_mm": summary(0.25)},
-        checks=object(), to_json=lambda: {"referee": facts},
+        checks=object(), to_json=lambda: {"exact_checks": facts},
     )  # fmt: skip
     learned = SimpleNamespace(
         policy="runs/ring", overall={"success": summary(NAN, 0)}, checks=None, to_json=dict
@@ -133,7 +133,7 @@ def found_setup(**fields) -> SimpleNamespace:
 def diagnosis(**fields) -> SimpleNamespace:
     values = {
         "verdict": SimpleNamespace(kind="setup", sentence="the frame is turned"),
-        "error_mm": SimpleNamespace(before=0.5, floor=0.05, ceiling=0.1), "track": None,
+        "error_mm": SimpleNamespace(before=0.5, floor=0.05, best_achievable=0.1), "track": None,
         "setup": None, "next_command": "", "next_experiment": None, "refit": None, "checks": (),
         "shown": (), "not_testable": (), "seconds": 1.5, "in_fit": 0.0,
         "left_out": "held-out blocks",
@@ -224,10 +224,10 @@ def test_amend_and_improve_write_nothing_where_nothing_is_claimed(
 ):
     rec, new, numbers = (str(p) for p in (bench / "bench.parquet", tmp_path / "n", tmp_path / "j"))
     rounds = [
-        SimpleNamespace(step="creep", together=True, rivals=("leak",), verdict="identified",
-                        sentence="creep is missing", error_open_mm=0.2),
-        SimpleNamespace(step=None, together=False, rivals=(), verdict="nothing_missing",
-                        sentence="it fits", error_open_mm=0.2),
+        SimpleNamespace(step="creep", together=True, competing=("leak",), verdict="identified",
+                        sentence="creep is missing", error_training_mm=0.2),
+        SimpleNamespace(step=None, together=False, competing=(), verdict="nothing_missing",
+                        sentence="it fits", error_training_mm=0.2),
     ]  # fmt: skip
     found = result(
         claimed=False, rounds=rounds, steps=[("creep", 0.3)], parameters=[PARAMETER, UNITLESS],

@@ -53,8 +53,8 @@ def test_noise_is_not_explained():
     slow = np.convolve(rng.normal(size=ROWS + 20), np.ones(20) / 20, mode="valid")[:ROWS]
     for effect in (np.zeros(ROWS), slow):
         result, _ = compare(still_model(), [recording(effect, pressure, noise_mm=None)])
-        assert result.ceiling.rmse_mm > 0.9 * result.rmse_mm
-        assert result.ceiling.rmse_mm <= result.rmse_mm
+        assert result.best_achievable.rmse_mm > 0.9 * result.rmse_mm
+        assert result.best_achievable.rmse_mm <= result.rmse_mm
 
 
 @pytest.mark.parametrize("hidden", ["creep", "leak"])
@@ -66,7 +66,7 @@ def test_compare_and_diagnose_give_one_floor_and_one_best_achievable_error(hidde
     found = diagnose(model, [made])
     result, _ = compare(model, [made], part="training")
     assert result.floor.rmse_mm == found.error_mm.floor
-    assert result.ceiling.rmse_mm == found.error_mm.ceiling
+    assert result.best_achievable.rmse_mm == found.error_mm.best_achievable
     assert result.rmse_mm == pytest.approx(found.error_mm.before, rel=0.01)
-    assert all(row.heldout_rmse_mm >= found.error_mm.ceiling for row in found.ranking)
-    assert found.error_mm.ceiling <= found.error_mm.before
+    assert all(row.heldout_rmse_mm >= found.error_mm.best_achievable for row in found.ranking)
+    assert found.error_mm.best_achievable <= found.error_mm.before

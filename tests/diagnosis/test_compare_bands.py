@@ -81,7 +81,7 @@ def test_command_says_the_verdict_first_and_writes_all(tmp_path, capsys):
     values = json.loads(out[0].read_text())
     assert values["sentence"] == lines[0]
     assert values["axes"][0]["axis"] == "pressure"
-    assert values["ceiling_mm"] < values["rmse_mm"]
+    assert values["best_achievable_mm"] < values["rmse_mm"]
     assert values["floor_mm"] == pytest.approx(np.sqrt(3) * NOISE_MM)
     assert out[2].read_bytes()[:4] == b"RRF2"
     text = (out[1] / "report.html").read_text()

@@ -46,7 +46,7 @@ def test_the_hidden_effect_is_named(found, name):
     assert first.gain_alone > 0.7
     assert first.heldout_rmse_mm < 0.5 * answer.error_mm.before
     assert answer.error_mm.floor < answer.error_mm.before
-    assert answer.error_mm.ceiling <= first.heldout_rmse_mm + 1e-9
+    assert answer.error_mm.best_achievable <= first.heldout_rmse_mm + 1e-9
 
 
 def test_the_same_data_gives_the_same_answer(found):
@@ -69,7 +69,8 @@ def test_command_writes_the_promised_json(tmp_path, capsys):
     said = json.loads(out.read_text())
     assert said["verdict"]["kind"] == "identified"
     assert said["verdict"]["effects"] == ["misalignment"]
-    assert set(said["error_mm"]) == {"before", "floor", "ceiling"}
+    assert set(said["error_mm"]) == {"before", "floor", "best_achievable", "ceiling"}
+    assert said["error_mm"]["ceiling"] == said["error_mm"]["best_achievable"]
     assert {"effect", "confidence", "gain_alone", "gain_unique", "heldout_rmse_mm", "ci95"} <= set(
         said["ranking"][0]
     )
@@ -190,8 +191,8 @@ def test_what_is_weak_about_the_data_is_told(found):
 )
 def test_what_would_explain_an_error_of_the_fit_is_told(effect, kind, chance, size, told):
     best = SimpleNamespace(effect=effect, gain=0.44)
-    race = SimpleNamespace(whole_size=size, in_fit=lambda name: False)
-    found = SimpleNamespace(first=[best], selection=race)
+    selection = SimpleNamespace(whole_size=size, in_fit=lambda name: False)
+    found = SimpleNamespace(first=[best], selection=selection)
     decision = SimpleNamespace(kind=kind, probabilities=SimpleNamespace(effects={effect: chance}))
     checks = would_explain(found, decision)
     assert len(checks) == (told is not None)

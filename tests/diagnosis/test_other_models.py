@@ -118,7 +118,7 @@ def test_the_diagnosis_is_that_of_the_arm(loaded, with_file):
     assert found.ranking[0].effect == truth.ranking[0].effect == "payload"
     assert found.ranking[0].confidence > 0.4
     assert found.error_mm.before == pytest.approx(truth.error_mm.before, abs=1e-4)
-    assert found.error_mm.ceiling == pytest.approx(truth.error_mm.ceiling, rel=0.15)
+    assert found.error_mm.best_achievable == pytest.approx(truth.error_mm.best_achievable, rel=0.15)
 
 
 def test_amend_puts_an_effect_behind_a_callable(loaded):

@@ -77,7 +77,7 @@ def test_a_test_needs_a_record_of_the_fit(model, known, other):
     amended = amend(forgetful, [known], "gain_mismatch", False, refit="never").model
     with pytest.raises(InputError, match="keeps no record of all rows"):
         compare(amended, [other], test=True)
-    assert compare(amended, [other])[0].to_json()["took_no_part"] is None
+    assert compare(amended, [other])[0].to_json()["held_out"] is None
     with pytest.raises(InputError, match="the model was fitted to"):
         compare(amended, [known], test=True)
     text = amended.fitted_rows.to_json()
@@ -91,8 +91,8 @@ def test_compare_says_what_the_error_is_no_test_of(model, known, other, tmp_path
     assert new.in_fit == 0.0
     assert "no test of the model, which was fitted to 100% of these rows" in seen.sentence
     assert "no test" not in new.sentence
-    assert seen.to_json()["took_no_part"] is False
-    assert new.to_json()["took_no_part"] is True
+    assert seen.to_json()["held_out"] is False
+    assert new.to_json()["held_out"] is True
     page = write_page(compare_page(seen, table, "t", "a"), tmp_path / "page.html").read_text()
     assert "of them in the model" in page
 
@@ -138,11 +138,11 @@ def test_amend_claims_no_fall_on_rows_of_the_fit(model, seen, sure, other, tmp_p
     assert sure.sentence.startswith(
         "no fall on unseen data is claimed, because the model had been fitted to 100%"
     )
-    assert seen.to_json()["error_mm"]["took_no_part"] is False
+    assert seen.to_json()["error_mm"]["held_out"] is False
     page = write_page(amend_page(seen, "t", "a"), tmp_path / "page.html").read_text()
     assert "they are not unseen data" in page
     new = amend(model, [other], "gain_mismatch", False, refit="never")
-    assert new.to_json()["error_mm"]["took_no_part"] is True
+    assert new.to_json()["error_mm"]["held_out"] is True
     assert replace(sure, in_fit=new.alone.in_fit).sentence.startswith("error ")
 
 

@@ -387,9 +387,10 @@ def _rounds(rounds: tuple[Round, ...]) -> Table:
     rows = [
         (
             f"{number}",
-            (done.step or "none") + (f" (or {', '.join(done.rivals)})" if done.rivals else ""),
+            (done.step or "none")
+            + (f" (or {', '.join(done.competing)})" if done.competing else ""),
             "-" if done.confidence is None else f"{done.confidence:.2f}",
-            f"{done.error_open_mm:.3f} mm",
+            f"{done.error_training_mm:.3f} mm",
             "-" if done.error_mm is None else f"{done.error_mm:.3f} mm",
             f"{done.verdict}: {done.sentence}",
         )

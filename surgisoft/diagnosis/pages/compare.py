@@ -69,7 +69,7 @@ def compare_page(
         title=title,
         verdict=_upper(result.sentence) + ".",
         about=about,
-        tone="good" if result.explainable is None and result.ceiling else "warn",
+        tone="good" if result.explainable is None and result.best_achievable else "warn",
         parts=[
             _facts(result),
             _depends(result, table),
@@ -115,8 +115,8 @@ def _facts(result: Comparison) -> Facts:
         ("tip", _mm(result.tip_rmse_mm)),
         (f"noise floor ({result.floor.source})", _mm(result.floor.rmse_mm)),
     ]
-    if result.ceiling is not None:
-        items.append(("best achievable error", _mm(result.ceiling.rmse_mm)))
+    if result.best_achievable is not None:
+        items.append(("best achievable error", _mm(result.best_achievable.rmse_mm)))
     if result.explainable is not None:
         items.append(("explainable", f"{100 * result.explainable:.0f} %"))
     if result.time_shift is not None:

@@ -64,7 +64,7 @@ def diagnosis_page(found: Diagnosis, title: str) -> Page:
     facts = [
         ("error", f"{error.before:.3f} mm"),
         ("noise floor", f"{error.floor:.3f} mm"),
-        ("best achievable error", f"{error.ceiling:.3f} mm"),
+        ("best achievable error", f"{error.best_achievable:.3f} mm"),
         ("time", f"{found.seconds:.1f} s"),
     ]
     if found.in_fit:

@@ -24,6 +24,7 @@ from surgisoft.diagnosis.setup.search import (
     Search,
 )
 from surgisoft.diagnosis.setup.words import SetupFault, faults_of, joined, signed_axes
+from surgisoft.files import with_former_keys
 from surgisoft.measurement.histories import actuation_of
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.model import ArmModel
@@ -41,7 +42,7 @@ FORMER_KEYS = {
     "alternative_mendings": "alternative_instructions",
     "mendable": "correctable",
 }
-"""Keys in JSON until 2026-11-23, each with its present name; programs may still read them."""
+"""Deprecated keys of the JSON, each with its present name."""
 MOST_APART = 8
 """Most recordings that are tested one by one where they share no fault."""
 
@@ -106,7 +107,7 @@ class SetupResult:
             "recordings": list(self.recordings),
             "correctable": self.correctable,
         }
-        return plain | {old: plain[new] for old, new in FORMER_KEYS.items()}
+        return with_former_keys(plain, FORMER_KEYS)
 
 
 def find_setup_faults(model: ArmModel, recordings: Sequence[Recording]) -> SetupResult | None:

@@ -180,7 +180,7 @@ def test_a_diagnosis_ends_with_the_set_up(model):
     found = diagnose(model, [turned(measured(), [0.0, 0.0, 2.0])])
     assert found.verdict.kind == "setup"
     assert found.verdict.effects == ()
-    assert found.error_mm.before > 10 * found.error_mm.ceiling
+    assert found.error_mm.before > 10 * found.error_mm.best_achievable
     plain = found.to_json()["setup"]
     assert plain["faults"][0]["kind"] == "frame"
     assert plain["correctable"] is plain["mendable"] is True

@@ -24,7 +24,7 @@ apart.
 """
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
@@ -268,17 +268,21 @@ class Mode:
     damping: float
     """Damping ratio."""
 
-    def follow(self, facts: ArmFacts, signal: Tensor, dt_s: Tensor) -> tuple[Tensor, Tensor]:
-        """(R, T, c) response y to signals u (R, T, c), and its acceleration y'', in u / s^2.
+    def follow(
+        self, facts: ArmFacts, signal: Tensor, dt_s: Tensor, rows: Callable[[Tensor], Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """(S, ...) response y to signals u (R, T, ...) on the looked-at rows, and its acceleration
+        y'', in u / s^2.
 
-        The signal is taken for linear between its rows, by its mean over each step.
+        The signal is taken for linear between its rows, by its mean over each step. It is followed
+        along all rows; rows picks those that are looked at from a (R, T, ...) tensor.
         """
-        mode = Inertia(facts, self.frequency_Hz, self.damping)
-        before = torch.cat([signal[:, :1], signal[:, :-1]], dim=1)
-        state = mode.scan(mode.rest(signal[:, 0]), (signal + before) / 2, Context(dt_s))
-        y, speed = state.unbind(-1)
+        mode, u = Inertia(facts, self.frequency_Hz, self.damping), signal.flatten(2)
+        before = torch.cat([u[:, :1], u[:, :-1]], dim=1)
+        state = mode.scan(mode.rest(u[:, 0]), (u + before) / 2, Context(dt_s), rows)
+        y, speed = (part.view(-1, *signal.shape[2:]) for part in state.unbind(-1))
         w = 2 * np.pi * self.frequency_Hz
-        return y, w**2 * (signal - y - 2 * self.damping * speed)
+        return y, w**2 * (rows(signal) - y - 2 * self.damping * speed)
 
 
 @torch.no_grad()
@@ -320,24 +324,24 @@ def _loads(problem: Problem, name: str, effect: Effect, body: np.ndarray) -> lis
     beam = Beam.through(facts.rest_mm)
     steps = history.dt_s[history.dt_s > 0]
     fastest = 1.0 / (SAMPLES_A_PERIOD * float(steps.median())) if len(steps) else 0.0
+    here = problem.rows(points)
     for frequency in FREQUENCIES_HZ:
         for damping in DAMPING_RATIOS if frequency <= fastest else ():
             mode = Mode(frequency, damping)
-            moved = torch.stack([mode.follow(facts, s.flatten(2), history.dt_s)[0] for s in still])
-            moved = moved.view(len(still), *shape)
-            _, acceleration = mode.follow(facts, points.flatten(2), history.dt_s)
-            force = -acceleration.view(shape) / STANDARD_GRAVITY_MM_S2
-            sensitivities = _rows(problem, moved + _pulled(beam, points, force))
+            moved = [mode.follow(facts, load, history.dt_s, problem.rows)[0] for load in still]
+            _, acceleration = mode.follow(facts, points, history.dt_s, problem.rows)
+            pulled = _pulled(beam, here, -acceleration / STANDARD_GRAVITY_MM_S2)
+            sensitivities = (torch.stack(moved) + pulled).movedim(0, -1).double().numpy()
             answer.append(Candidate(name, type(effect)(facts), sensitivities, removable=True))
     return answer
 
 
 def _pulled(beam: Beam, points: Tensor, force: Tensor) -> Tensor:
-    """(2, R, T, n, 3) displacement, mm, by forces at the key points, for 1 mm of each sag.
+    """(2, S, n, 3) displacement, mm, by forces at the key points, for 1 mm of each sag.
 
-    force: (R, T, n, 3) force of a mass at each key point over its weight. The first load is at the
-    tip; the second one lies along the body, the share of each key point that of the body nearest to
-    it (`Payload` states the units).
+    points: (S, n, 3) key points, mm; force: (S, n, 3) force of a mass at each key point over its
+    weight. The first load is at the tip; the second one lies along the body, the share of each key
+    point that of the body nearest to it (`Payload` states the units).
     """
     p = points.mT.contiguous()
     chords, length = p @ beam.chords, beam.length_mm

@@ -12,6 +12,7 @@ Q' = l Q + w^2 p, a linear recurrence.
 """
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
@@ -102,10 +103,20 @@ class Inertia(Effect):
         rate = cosine * speed - sine / swing * (away + damping * speed)
         return torch.stack([y, rate], dim=-1)
 
-    def scan(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
-        """(R, T, m, 2) y and y' / w along the actuation (R, T, m)."""
+    def scan(
+        self,
+        memory: Tensor,
+        signal: Tensor,
+        context: Context,
+        rows: Callable[[Tensor], Tensor] | None = None,
+    ) -> Tensor:
+        """(R, T, m, 2) y and y' / w along the actuation (R, T, m).
+
+        rows: picks rows (S, ...) of a (R, T, ...) tensor; the result is then (S, m, 2).
+        """
         keep, addend = self._drive(signal, context.dt_s)
-        return self._from_mode(linear_scan(keep, addend, self._to_mode(memory)))
+        mode = linear_scan(keep, addend, self._to_mode(memory))
+        return self._from_mode(mode if rows is None else rows(mode))
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
         """Effective actuation (..., m) from actuation (..., m) and oscillators (..., m, 2)."""

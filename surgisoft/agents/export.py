@@ -19,11 +19,11 @@ import torch
 from torch import Tensor
 
 from surgisoft.agents import controller_runner
+from surgisoft.agents.actor import ScaledActor
 from surgisoft.agents.controller import ControllerGraph, goal_docs
 from surgisoft.agents.controller_runner import Controller
 from surgisoft.agents.learned import LearnedPolicy
 from surgisoft.agents.observer import ObserverGains
-from surgisoft.agents.policy_network import ScaledActor
 from surgisoft.errors import InputError
 from surgisoft.files import json_safe, new_folder, write_json
 from surgisoft.graphs import DoesNotTrace, largest_difference, write_onnx, write_torch_script

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from surgisoft.agents.policy_network import ScaledActor, empty_actor
+from surgisoft.agents.actor import Actor, ScaledActor
 from surgisoft.agents.presets import Preset
 from surgisoft.agents.run_folder import BEST, LAST, RunFolder, damaged
 from surgisoft.errors import InputError, unknown_name
@@ -54,7 +54,7 @@ class LearnedPolicy(ActorPolicy):
                 weights = weights if which == BEST else weights["actor_state_dict"]
                 sizes = size["observation"], size["chambers"]
                 check_weights(file, agent, weights, *sizes, plan.preset)
-                actor = empty_actor(agent, *sizes, plan.preset)
+                actor = Actor(*sizes, plan.preset)
                 actor.load_state_dict(weights)
                 scaled = ScaledActor(actor, plan.preset.action_kPa, size["step_kPa"])
                 actors[agent] = scaled.to(device).eval().requires_grad_(False)
@@ -71,7 +71,7 @@ def check_weights(
     The actor is laid out without memory for its numbers, so that a false size costs nothing.
     """
     with torch.device("meta"):
-        expected = empty_actor(agent, width, chambers, preset).state_dict()
+        expected = Actor(width, chambers, preset).state_dict()
     for name, value in expected.items():
         shape = list(weights[name].shape) if name in weights else "no"
         if shape != list(value.shape):

@@ -69,7 +69,6 @@ def open_policy(name: str, task: Task) -> Policy:
     check_policy(name)
     if name in POLICIES:
         return POLICIES[name]()
-    # Only here: loading rsl-rl takes seconds, which the untrained policies need not wait for.
     from surgisoft.agents.learned import LearnedPolicy
 
     return LearnedPolicy(Path(name), task)

@@ -1,4 +1,4 @@
-"""Networks of actors and critics for rsl-rl, and the actor with its outputs scaled to kPa."""
+"""Networks of actors and critics that rsl-rl trains."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from rsl_rl.models import MLPModel
 from rsl_rl.modules.distribution import GaussianDistribution
-from tensordict import TensorDict
 from torch import Tensor, nn
 
 from surgisoft.agents.presets import Preset
@@ -73,26 +72,14 @@ class ActionNoise(GaussianDistribution):
         return 0.5 * (apart + (ratio - 1.0 - ratio.log()).sum())
 
 
-def empty_actor(agent: str, width: int, chambers: int, preset: Preset) -> MLPModel:
-    """An untrained actor: (B, width) observations in, (B, chambers) outputs out."""
-    seen = TensorDict({agent: torch.zeros(1, width)}, batch_size=[1])
-    config = {**network_config(preset), "distribution_cfg": noise_config(preset)}
-    return MLPModel(seen, {"actor": [agent]}, "actor", chambers, **config)
+def acting(actor: MLPModel) -> nn.Module:
+    """A copy of an actor that acts as a saved policy does: observations (B, D) in, outputs (B, m).
 
-
-class ScaledActor(nn.Module):
-    """An actor with action scaling: (B, D) observations to (B, m) changes of pressure, kPa."""
-
-    def __init__(self, actor: MLPModel, action_kPa: float, step_kPa: float):
-        """Scale an actor: action_kPa per output of 1, clipped to the pumps' limit step_kPa."""
-        super().__init__()
-        self.network, self.scale, self.limit = actor.as_jit(), action_kPa, step_kPa
-        # What is evaluated is what a saved policy computes, to the last bit.
-        _exchange_activations(self.network.mlp, CompiledTanh, nn.Tanh)
-
-    def forward(self, observation: Tensor) -> Tensor:
-        """Actions (B, m) kPa, within the limits of the pumps, from observations (B, D)."""
-        return (self.scale * self.network(observation)).clamp(-self.limit, self.limit)
+    What is evaluated during a training is then what the saved policy computes, to the last bit.
+    """
+    network = actor.as_jit()
+    _exchange_activations(network.mlp, CompiledTanh, nn.Tanh)
+    return network
 
 
 # The hyperbolic tangent ----------------------------------------------------------------------

@@ -21,10 +21,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from surgisoft.agents.actor import ScaledActor
 from surgisoft.agents.distributed import Processes
 from surgisoft.agents.learned import ActorPolicy, agent_sizes, check_weights
 from surgisoft.agents.loggers import TENSORBOARD, LoggerFailed, open_writer
-from surgisoft.agents.policy_network import ScaledActor
+from surgisoft.agents.policy_network import acting
 from surgisoft.agents.ppo import RolloutMeans, collect_rollout, make_ppo, set_noise
 from surgisoft.agents.presets import Plan
 from surgisoft.agents.run_folder import BEST, LAST, RunFolder, create_run, damaged
@@ -351,7 +352,9 @@ def _evaluated(run: RunFolder, training: Training) -> dict[str, float]:
     preset = training.plan.preset
     actors = {
         agent: ScaledActor(
-            ppo.get_policy(), preset.action_kPa, training.task.world.arms[agent].pneumatics.step_kPa
+            acting(ppo.get_policy()),
+            preset.action_kPa,
+            training.task.world.arms[agent].pneumatics.step_kPa,
         ).eval()
         for agent, ppo in training.agents.items()
     }

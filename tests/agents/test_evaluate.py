@@ -165,8 +165,8 @@ def test_bad_input_is_one_line_and_code_2(arguments, named, capsys):
 
 
 def test_a_run_brings_its_task_and_refuses_another(tmp_path, capsys, short):
+    from surgisoft.agents.actor import Actor
     from surgisoft.agents.learned import agent_sizes
-    from surgisoft.agents.policy_network import empty_actor
     from surgisoft.agents.presets import Plan, preset_for
     from surgisoft.agents.run_folder import BEST, create_run
     from surgisoft.tasks.registry import read_config
@@ -175,7 +175,7 @@ def test_a_run_brings_its_task_and_refuses_another(tmp_path, capsys, short):
     task, plan = make_task("track_circle", config), Plan("track_circle", config, "fast", preset, 1)
     sizes = agent_sizes(task)
     made = create_run(tmp_path / "run", plan, task, sizes, 1)
-    actor = empty_actor("arm", sizes["arm"]["observation"], sizes["arm"]["chambers"], preset)
+    actor = Actor(sizes["arm"]["observation"], sizes["arm"]["chambers"], preset)
     made.save(BEST, {"iteration": 0, "agents": {"arm": actor.state_dict()}})
     folder = str(made.path)
 
@@ -226,12 +226,14 @@ def test_a_policy_of_another_scene_is_warned_of(tmp_path):
     assert "ring was trained in another scene (phantom_liver) than other" in told[0]
 
 
-def test_the_command_without_pictures_imports_none_of_their_libraries():
-    """Matplotlib and Rerun, which only pages and replays need, take a second to import."""
+def test_the_command_imports_nothing_of_pictures_and_training():
+    """Matplotlib and Rerun, which only pages and replays need, and rsl-rl, which only training
+    needs, take seconds to import."""
     code = (
         "import sys; from surgisoft.cli import run; "
-        "run('evaluate random --task track_circle --episodes 1'.split()); "
-        "print(sorted({'matplotlib', 'rerun', 'torch'} & set(sys.modules)))"
+        "run('evaluate ring --episodes 1 --no-exact-checks'.split()); "
+        "slow = {'matplotlib', 'rerun', 'rsl_rl', 'tensordict', 'torch', 'torch._dynamo'}; "
+        "print(sorted(slow & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "['torch']"

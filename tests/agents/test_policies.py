@@ -4,18 +4,22 @@ import math
 
 import pytest
 import torch
+from rsl_rl.models import MLPModel
+from tensordict import TensorDict
 from torch.distributions import Normal, kl_divergence
 
+from surgisoft.agents.actor import Actor, ScaledActor
 from surgisoft.agents.policies import Random, open_policy
 from surgisoft.agents.policy_network import (
     LEAST_COMPILED,
     ActionNoise,
     CompiledTanh,
-    ScaledActor,
+    acting,
     compile_activations,
-    empty_actor,
+    network_config,
+    noise_config,
 )
-from surgisoft.agents.presets import Preset
+from surgisoft.agents.presets import ACTIVATIONS, Preset
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.registry import make_task
@@ -25,6 +29,13 @@ from surgisoft.tasks.world.pytree import rows
 @pytest.fixture(scope="module")
 def task():
     return make_task("track_circle")
+
+
+def trained_by_rsl_rl(width, chambers, preset):
+    """An actor of rsl-rl as a training makes it: what checkpoints hold the weights of."""
+    seen = TensorDict({"arm": torch.zeros(1, width)}, batch_size=[1])
+    config = {**network_config(preset), "distribution_cfg": noise_config(preset)}
+    return MLPModel(seen, {"actor": ["arm"]}, "actor", chambers, **config)
 
 
 def test_random_actions_do_not_depend_on_the_rest_of_the_batch(task):
@@ -69,11 +80,30 @@ def test_what_drives_nothing_is_one_line(name, task):
 def test_outputs_are_scaled_and_clipped_to_the_pumps_step():
     torch.manual_seed(0)
     preset = Preset(hidden=(5,), action_kPa=2.5)
-    actor, seen = empty_actor("arm", 7, 3, preset), 20.0 * torch.randn(50, 7)
-    plain = actor.as_jit()(seen)
+    actor, seen = Actor(7, 3, preset), 20.0 * torch.randn(50, 7)
+    plain = actor(seen)
     found = ScaledActor(actor, preset.action_kPa, 0.4)(seen)
     torch.testing.assert_close(found, (2.5 * plain).clamp(-0.4, 0.4))
     assert (2.5 * plain).abs().min() < 0.4 < plain.abs().max()
+
+
+@pytest.mark.parametrize("activation", sorted(set(ACTIVATIONS)))
+@pytest.mark.parametrize("normalise", [False, True])
+@pytest.mark.parametrize("last_noise", [None, 0.05])
+def test_a_saved_policy_acts_as_rsl_rl_says_to_the_last_bit(activation, normalise, last_noise):
+    torch.manual_seed(0)
+    preset = Preset(
+        hidden=(9, 6), activation=activation, normalise=normalise, last_noise=last_noise
+    )
+    trained, seen = trained_by_rsl_rl(7, 3, preset), 2.0 * torch.randn(50, 7)
+    trained.train().update_normalization(TensorDict({"arm": 3.0 * seen + 1.0}, batch_size=[50]))
+    saved, actor = trained.state_dict(), Actor(7, 3, preset)
+    assert list(actor.state_dict()) == list(saved)
+    actor.load_state_dict(saved)
+    expected = trained.eval()(TensorDict({"arm": seen}, batch_size=[50]))
+    assert torch.equal(actor.eval()(seen), expected)
+    assert torch.equal(acting(trained)(seen), expected)
+    assert expected.std() > 1e-3
 
 
 def test_compiled_tanh_is_tanh_and_so_is_its_gradient():
@@ -90,7 +120,7 @@ def test_compiled_tanh_is_tanh_and_so_is_its_gradient():
 
 
 def test_a_training_computes_every_tanh_by_the_compiled_one(task):
-    actor = empty_actor("arm", 5, 3, Preset(hidden=(8, 8)))
+    actor = trained_by_rsl_rl(5, 3, Preset(hidden=(8, 8)))
     batch = LEAST_COMPILED // 8
     seen = torch.randn(batch, 5, generator=torch.Generator().manual_seed(0))
     before, names = actor.mlp(seen), list(actor.state_dict())
@@ -98,11 +128,12 @@ def test_a_training_computes_every_tanh_by_the_compiled_one(task):
     assert [type(layer) for layer in actor.mlp].count(CompiledTanh) == 2
     assert list(actor.state_dict()) == names
     assert torch.allclose(actor.mlp(seen), before, atol=1e-5)
+    assert torch.equal(acting(actor)(seen), before)
 
 
 @pytest.mark.parametrize("last_noise", [None, 0.05])
 def test_the_noise_of_actions_is_that_of_independent_normal_distributions(last_noise):
-    noise = empty_actor("arm", 5, 3, Preset(last_noise=last_noise)).distribution
+    noise = trained_by_rsl_rl(5, 3, Preset(last_noise=last_noise)).distribution
     assert isinstance(noise, ActionNoise)
     with torch.no_grad():
         noise.log_std_param.copy_(torch.tensor([-1.5, 0.2, -0.1]))

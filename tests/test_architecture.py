@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks.structure import circles, importers, modules
+from surgisoft.surrogate.effects import EFFECTS
+from surgisoft.tasks.world.random_effects import KINDS as RANDOM_EFFECTS
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "surgisoft"
@@ -369,6 +371,46 @@ def private_names(source: str) -> list[str]:
                 found += [str(text).rpartition(".")[2] for text in texts]
     own = [name for name in found if name.isidentifier() and name not in OF_LIBRARIES]
     return [name for name in own if name.startswith("_") and not name.startswith("__")]
+
+
+EFFECT_NAMES = {
+    "demonstration/story.py": {"creep"},  # hidden in the recording of the demonstration
+    "diagnosis/candidates.py": {"inertia"},  # its equation of motion, for every load that swings
+    "diagnosis/error_axes.py": {"payload"},  # the axis of a recorded load, not the effect
+    "diagnosis/setup/search.py": {"misalignment"},  # its limits: a larger turn is a wrong frame
+    "surrogate/compiled_step.py": {"hysteresis"},  # its step, compiled
+    "tasks/world/random_effects.py": set(RANDOM_EFFECTS),  # those that domain randomization draws
+}
+"""Modules that name an effect, and which; everything else asks an effect's `Hypothesis`."""
+OTHER_MEANING = {"tasks": {"contact"}, "experiments": {"contact"}}
+"""Part -> effect names that are words of its own there: contact of an arm with a body."""
+
+
+def effects_named_in(path: Path, text: str) -> set[str]:
+    """Effects whose names stand in a module as texts, or whose modules it imports."""
+    found = set()
+    for node in ast.walk(ast.parse(text)):
+        match node:
+            case ast.Constant(value=str(word)):
+                found.add(word)
+            case ast.ImportFrom(module=str(module)) if ".effects." in module:
+                found.add(module.rpartition(".")[2])
+    part = path.relative_to(PACKAGE).parts[0]
+    return (found & set(EFFECTS)) - OTHER_MEANING.get(part, set())
+
+
+def test_only_stated_modules_name_effects():
+    """A new effect is tried, shown and reported without a change of any other module."""
+    beside = {PACKAGE / "surrogate" / "effects", PACKAGE / "rig"}
+    named = {
+        str(path.relative_to(PACKAGE)): effects_named_in(path, path.read_text())
+        for path in FILES
+        if beside.isdisjoint(path.parents)
+    }
+    assert {name: some for name, some in named.items() if some} == EFFECT_NAMES
+    for line in ("a == 'creep'", "from surgisoft.surrogate.effects.creep import Creep"):
+        assert effects_named_in(PACKAGE / "diagnosis" / "a.py", line) == {"creep"}
+    assert not effects_named_in(PACKAGE / "tasks" / "a.py", "{'contact': 1}")
 
 
 def test_no_test_uses_a_private_name():

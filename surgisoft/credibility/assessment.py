@@ -30,6 +30,7 @@ from surgisoft.files import json_safe, with_former_keys
 from surgisoft.measurement.histories import actuation_of, history_of
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.arm import ArmSpec
+from surgisoft.surrogate.effects import hypothesis_of
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.workers import torch_threads
 
@@ -400,8 +401,9 @@ def _vector(values: np.ndarray) -> str:
 
 
 def _load(model: ArmModel, recordings: Sequence[Recording]) -> Input:
-    name, loaded = "load at the arm [g]", "payload" in model.effects
-    ours = "a payload as fitted" if loaded else "none"
+    name = "load at the arm [g]"
+    loaded = [of for of, effect in model.effects.items() if hypothesis_of(effect).own_weight]
+    ours = f"{' and '.join(loaded)}, as fitted" if loaded else "none"
     loads = [each.payload_g for each in recordings if each.payload_g is not None]
     if len(loads) < len(recordings) or any(np.isnan(each).any() for each in loads):
         return Input(name, "not stated", ours, None)

@@ -176,9 +176,8 @@ SIMPLE_SHARE = 0.2
 EFFECT_SHARE = 0.5
 """Share of the epochs for an effect's stage, whose epochs are longer and fewer needed."""
 AUTO = "auto"
-"""In the place of an effect's name: effects with memory are tried, and the best are added."""
-MEMORY_EFFECTS = ("line_lag", "rate_dependence", "creep", "hysteresis")
-"""Effects that `auto` tries. The last one needs no clock."""
+"""In the place of an effect's name: effects with memory (`Hypothesis.memory`) are tried, and the
+best are added."""
 TRIAL_SHARE = 0.25
 """Share of the epochs for which `auto` trains each candidate before it compares them."""
 MEMBER_SHARE = 1.0
@@ -591,8 +590,9 @@ def _add_memory(data: Data, spec, config, support: _Support, result: FitResult, 
     Each candidate is trained together with the network for a share of the epochs, and so is the
     model without any. The best one then goes through a stage of its own, as if it had been named.
     """
-    timed = _timed(data.train)
-    names = [name for name in MEMORY_EFFECTS if timed or name == MEMORY_EFFECTS[-1]]
+    timed, known = _timed(data.train), known_effects()
+    memory = {name: hypothesis_of(kind).memory for name, kind in known.items()}
+    names = [name for name, of in memory.items() if of == "path" or (of and timed)]
     if not timed:
         result.warnings.append(
             "the rows have no clock, so that lags, rates and creep cannot show: not tried"
@@ -602,7 +602,7 @@ def _add_memory(data: Data, spec, config, support: _Support, result: FitResult, 
         name
         for name in names
         if name not in taken
-        and (not hypothesis_of(known_effects()[name]).needs_reversals or support.use(name).any())
+        and (not hypothesis_of(known[name]).needs_reversals or support.use(name).any())
     ]
     epochs = max(CHECK_EVERY, round(TRIAL_SHARE * config.epochs))
     for _ in range(MOST_AUTO):

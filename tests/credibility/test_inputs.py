@@ -36,6 +36,7 @@ from surgisoft.errors import InputError
 from surgisoft.experiments.spec import Case, load_experiment
 from surgisoft.measurement.recordings import Recording, save_recording
 from surgisoft.surrogate.arm import ArmSpec
+from surgisoft.surrogate.effects import EFFECTS
 from surgisoft.tasks.episodes.file import save_episode
 from tests.experiments import tiny
 from tests.tasks.test_episode import made_up
@@ -59,7 +60,7 @@ def context(**more) -> Context:
 
 
 def model_of(spec: ArmSpec, *effects: str):
-    return SimpleNamespace(spec=spec, effects=effects)
+    return SimpleNamespace(spec=spec, effects={name: EFFECTS[name] for name in effects})
 
 
 LOADED = {"payload_g": np.full(60, 20.0)}
@@ -78,7 +79,7 @@ WARM = {"temp_C": np.full(60, 25.0)}
         ({}, (), {}, 3, ("not stated", "none", None)),
         ({}, (), UNLOADED, 3, ("0 to 0", "none", True)),
         ({}, (), LOADED, 3, ("20 to 20", "none", False)),
-        ({}, ("payload",), LOADED, 3, ("20 to 20", "a payload as fitted", None)),
+        ({}, ("payload",), LOADED, 3, ("20 to 20", "payload, as fitted", None)),
         ({}, (), {}, 4, ("not stated", "not stated", None)),
         ({}, (), WARM, 4, ("25.0 to 25.0", "not stated", None)),
         ({"temperature_C": 24.0}, (), WARM, 4, ("25.0 to 25.0", "24.0", True)),

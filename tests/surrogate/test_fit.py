@@ -1,5 +1,7 @@
 """Fitting: it finds what is there, leaves out what the data cannot support, and is repeatable."""
 
+import re
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +9,8 @@ import pytest
 import torch
 
 from surgisoft.errors import InputError
+from surgisoft.surrogate.effects import hypothesis_of
+from surgisoft.surrogate.effects.twist import Twist
 from surgisoft.surrogate.fit import FitConfig, excitation, fit
 from surgisoft.surrogate.history import pack
 from surgisoft.surrogate.interval import coverage_of
@@ -288,6 +292,23 @@ def test_auto_adds_nothing_to_an_arm_without_memory():
     assert not result.model.effects
     reasons = ("no effect with memory added", "no gain beyond chance")
     assert any(reason in warning for reason in reasons for warning in result.warnings)
+
+
+def test_auto_tries_the_effects_that_ask_for_it(monkeypatch):
+    asking = replace(hypothesis_of(Twist), memory="time")
+    monkeypatch.setattr(sys.modules[Twist.__module__], "HYPOTHESIS", asking)
+    timed = runs(range(10))
+    of_time = {"line_lag", "rate_dependence", "creep", "twist"}
+    for recorded, tried in (
+        (timed, {"hysteresis"} | of_time),
+        (replace(timed, t_s=torch.zeros_like(timed.t_s)), {"hysteresis"}),
+    ):
+        result = fit(recorded, None, SPEC, replace(SMALL, effects=("auto",), epochs=10))
+        found = {name for stage in result.stages for name in stage.tried_mm or {}}
+        for warning in result.warnings:
+            if warning.startswith("no effect with memory added"):
+                found |= set(re.findall(r"(\w+) \d+\.\d{3}", warning))
+        assert found - {"none"} == tried
 
 
 @pytest.mark.parametrize(

@@ -142,4 +142,4 @@ def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
     return [Creep(facts, tau, width) for tau, width in GRID]
 
 
-HYPOTHESIS = Hypothesis(Creep, _grid)
+HYPOTHESIS = Hypothesis(Creep, _grid, memory="time")

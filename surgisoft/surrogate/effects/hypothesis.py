@@ -26,6 +26,8 @@ def no_combinations(some: list[Effect]) -> list[list[int]]:
 
 MeasuredBody = Literal["", "gain", "load"]
 """Ways in which an effect may act on a measured body, see `Hypothesis.measured_body`."""
+Memory = Literal["", "time", "path"]
+"""What an effect that `fit` may add by itself depends on, see `Hypothesis.memory`."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,10 @@ class Hypothesis:
     empty: the effect is no such load."""
     tip_mass: str = ""
     """Amplitude by which a mass at the tip acts, for an effect that is a load along gravity."""
+    memory: Memory = ""
+    """Whether `fit --effects auto` tries the effect, and what its memory depends on: `time`, which
+    takes recordings with a clock, or `path`, the order of the actuations alone, which steady-state
+    samples show as well. Empty: `auto` does not try it."""
     measured_body: MeasuredBody = ""
     """What the effect does to a body that was measured before a change: `gain` scales its whole
     motion, `load` pulls it along gravity, at rest and in motion. Empty: it is tried on the

@@ -226,4 +226,4 @@ def _further(facts: ArmFacts, points: Tensor) -> list[Effect]:
     return [Hysteresis(facts, FEW_RADII, True, False, others) for others in some]
 
 
-HYPOTHESIS = Hypothesis(Hysteresis, _grid, _further, needs_reversals=True)
+HYPOTHESIS = Hypothesis(Hysteresis, _grid, _further, needs_reversals=True, memory="path")

@@ -231,5 +231,6 @@ HYPOTHESIS = Hypothesis(
     _grid,
     combinations=no_combinations,
     needs_motion=True,
+    memory="time",
     absent_in="short_tube",
 )

@@ -155,4 +155,6 @@ def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
 
 
 # A wall has one fluid; several of both signs together would be a lead.
-HYPOTHESIS = Hypothesis(RateDependence, _grid, combinations=no_combinations, needs_motion=True)
+HYPOTHESIS = Hypothesis(
+    RateDependence, _grid, combinations=no_combinations, needs_motion=True, memory="time"
+)

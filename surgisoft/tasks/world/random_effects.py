@@ -36,6 +36,8 @@ KINDS = (
 friction would be a second hysteresis of 360 weights, and contact needs a place."""
 BOTH_SIGNS = ("gain_mismatch", "twist", "coupling", "stiffening")
 """Effects of which either sign occurs; the others lose energy or weigh something."""
+ONE_BY_ONE = ("gain_mismatch",)
+"""Effects of which every amplitude is drawn separately, as each chamber has its own gain."""
 PROBE = 0.02
 """Amplitude at which an effect's influence on the tip is measured, to first order."""
 PROBE_STEPS, PROBE_ARMS, PROBE_S = 40, 16, 0.5
@@ -66,9 +68,8 @@ class RandomEffects:
         effects, own = dict(model.effects), list(model.effects)
         self.kinds: list[list[str]] = []
         for kind in KINDS:
-            # Of a vector of amplitudes each entry is an effect of its own.
             count = sum(p.numel() for p in make_effect(kind, model.facts).amplitudes().values())
-            vector = kind == "gain_mismatch"
+            vector = kind in ONE_BY_ONE
             names = []
             for entry in range(count if vector else 1):
                 names.append(free_name(kind, effects))

@@ -12,10 +12,8 @@ from surgisoft.report import Picture
 from surgisoft.report.charts import AMBER, BLUE, CHART, GREEN, RED, chart, drawing
 from surgisoft.report.style import INK, MUTED
 from surgisoft.scene.dose_patch import HEALTHY, LESION
-from surgisoft.tasks.episodes.log import EpisodeLog
+from surgisoft.tasks.episodes.log import JUMP_MM, EpisodeLog
 
-JUMP_MM = 3.0
-"""A target that goes farther in a step has jumped: no line is drawn (mm)."""
 OFFSET_MM = 2.0
 """The unrolled dose is shown so far on either side of the ring (mm)."""
 CELL_MM = 0.25

@@ -26,6 +26,7 @@ from surgisoft.measurement.recordings import (
     load_recordings,
     with_predictions,
 )
+from surgisoft.measurement.recordings.file import SUFFIXES
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.callables.arm import arm_around, statements, validation_of
 from surgisoft.surrogate.callables.named import (
@@ -57,8 +58,6 @@ LEAST_REPRODUCED = 0.9
 """Least share of the predicted squared motion that the polynomial, with the features of the past,
 has to give back on held-out blocks for effects on the actuation to be judged: the share of the
 motion that such an effect changes is then known to about a third (the root of what is left)."""
-SUFFIXES = (".csv", ".parquet")
-"""Suffixes of files of predictions."""
 
 Given = Iterable[Recording | str | Path] | Recording | str | Path
 """Recordings, their files, or folders of them."""

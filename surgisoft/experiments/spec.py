@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,7 +22,7 @@ from surgisoft.config import (
     write_toml,
 )
 from surgisoft.errors import InputError
-from surgisoft.scene.spec import SCENES, Length, Point
+from surgisoft.scene.spec import SCENES, Length, Name, Point
 from surgisoft.tasks.registry import spec_of, task_names, with_present_names
 from surgisoft.tasks.spec import TaskSpec
 
@@ -40,13 +39,6 @@ PLANTS = ("simulation", "rig")
 SCRIPTED, NOMINAL = "scripted", "nominal"
 """The task's expert, which knows the true state; the one that assumes the scene's mounts."""
 
-Name = Annotated[
-    str,
-    Rule(
-        "a name of letters, digits, '_' and '-' (at most 64)",
-        lambda text: re.fullmatch(r"[A-Za-z0-9_-]{1,64}", text) is not None,
-    ),
-]
 Duration = Annotated[float, Rule("a time from 0 to 100000 s", lambda s: 0.0 <= s <= 1e5)]
 Positive = Annotated[float, Rule("a time above 0 s", lambda s: 0.0 < s <= 1e5)]
 Count = Annotated[int, Rule("a whole number from 1 to 100000", lambda n: 1 <= n <= 100_000)]

@@ -25,7 +25,7 @@ from surgisoft.replay.contents import TIME
 from surgisoft.replay.episode_view import Replay
 from surgisoft.replay.legends import legend_picture
 from surgisoft.replay.plots import Line, series_colour, time_axis
-from surgisoft.replay.recording import Columns, new_recording
+from surgisoft.replay.recording import LEGEND, LEVELS, Columns, new_recording
 from surgisoft.replay.shapes import finer
 from surgisoft.tasks.episodes.parts import Event
 from surgisoft.time_axis import continued, pauses
@@ -36,10 +36,8 @@ LINE_MM = 2.0
 """Spacing of the drawn centreline's points (mm)."""
 MEASURED_WIDE, PREDICTED_WIDE, POINT_WIDE, ARROW_WIDE, BAR_WIDE = 0.012, 0.006, 0.014, 0.006, 0.005
 """Radii of what is drawn, as shares of the body's length: a short and a long arm look alike."""
-LEGEND, SEEN, EVENTS = "/legend", "/seen", "/events"
-"""Entities of the legend's picture, of the text panel and of the events."""
-LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
-"""An event's level in Rerun's text log."""
+SEEN, EVENTS = "/seen", "/events"
+"""Entities of the text panel and of the events."""
 
 
 def write_comparison(

@@ -28,21 +28,19 @@ from surgisoft.replay.contents import TIME
 from surgisoft.replay.endoscope import PICTURES_HZ, camera_entity, log_camera
 from surgisoft.replay.legends import dose_picture
 from surgisoft.replay.plots import Plot, plots_of, time_axis
-from surgisoft.replay.recording import STEP, Columns, new_recording
+from surgisoft.replay.recording import LEGEND, LEVELS, STEP, Columns, new_recording
 from surgisoft.replay.shapes import creased, widest_apart
 from surgisoft.replay.surfaces import DosedSurface, dosed_surface
 from surgisoft.scene import frames
 from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.rays import EmbreeSurface
 from surgisoft.scene.render import LESION_TINT
-from surgisoft.tasks.episodes.log import DoseLog, EpisodeLog
+from surgisoft.tasks.episodes.log import JUMP_MM, DoseLog, EpisodeLog
 
 SCENE = "Scene"
 """Name of the 3D view."""
 TRAIL = "/path/real"
 """Entity that is shown from the start of the episode up to the current time."""
-LEGEND = "/legend"
-"""Text that explains the colours of the 3D view."""
 
 
 DOSE = "/dose_scale"
@@ -197,14 +195,10 @@ FLAT = ("/events", LEGEND, DOSE)
 """Entities that views other than the 3D view show."""
 PLAN_MM, REAL_MM = 0.28, 0.36
 """Radii of the reference path and, thicker so that it covers it, of the actual path (mm)."""
-JUMP_MM = 3.0
-"""A target that moves farther than this in one step has jumped (mm)."""
 RING_CORNERS, RING_WIDER = 24, 1.15
 """Corners of the rings around a target body, and their radius in radii of the arm."""
 DOSE_HZ = 2.5
 """Rate at which the organ's colours are updated (1/s)."""
-LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
-"""An event's level in Rerun's text log."""
 
 
 @dataclass(frozen=True)

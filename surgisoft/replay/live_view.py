@@ -31,7 +31,7 @@ from surgisoft.replay.colours import (
     series_colour,
 )
 from surgisoft.replay.plots import Corner, last_seconds, time_axis
-from surgisoft.replay.recording import SUFFIX, TIME
+from surgisoft.replay.recording import LEGEND, SUFFIX, TIME
 from surgisoft.replay.shapes import finer
 from surgisoft.replay.viewer import (
     LOCAL,
@@ -56,8 +56,6 @@ FLUSH_S = 30.0
 for ever where a disk is full."""
 EVENTS = "/events"
 """Entity of the text log."""
-LEGEND = "/legend"
-"""Text that explains the colours of the 3D view."""
 LEGEND_TEXT = f"""- **white**: measured body
 - **red**: body that the model predicts
 - **points**: measured key points, {" to ".join(ERROR_NAMES)} from 0 to {LARGE_MM:g} mm of residual

@@ -21,6 +21,10 @@ SUFFIX = ".rrd"
 """Suffix of a Rerun recording."""
 STEP = "step"
 """Timeline of the rows of the log; that of seconds is `contents.TIME`."""
+LEGEND = "/legend"
+"""Entity of the text or picture that explains the colours of the 3D view."""
+LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
+"""An event's level in Rerun's text log."""
 _IMPORTED_IN = os.getpid()
 """The process that imported this module: a fork of it cannot flush recordings of its parent."""
 

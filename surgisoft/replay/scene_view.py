@@ -7,6 +7,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from surgisoft.error_scale import bar_length
+from surgisoft.replay.arms import BORE_MM
 from surgisoft.replay.colours import (
     ARM_COLOURS,
     BACKGROUND,
@@ -19,7 +20,7 @@ from surgisoft.replay.colours import (
     ROLE_NAMES,
     SHAFT_COLOUR,
 )
-from surgisoft.replay.recording import new_recording
+from surgisoft.replay.recording import LEGEND, new_recording
 from surgisoft.replay.shapes import creased, finer, polar_patch, tube, view_cone, widest_apart
 from surgisoft.scene import frames
 from surgisoft.scene.check import mounted_arms
@@ -36,12 +37,8 @@ from surgisoft.scene.mounted_arm import (
 )
 from surgisoft.scene.reach import ArmReach
 
-BORE_MM = 1.5
-"""Radius of the arm's channel (mm); it is 3 mm across in the paper's arm."""
 LIFT_MM = 0.5
 """Height of drawings above the surface they lie on, so that it does not hide them (mm)."""
-LEGEND = "/legend"
-"""Text that explains the colours of the 3D view."""
 BAR_SHARE = 0.3
 """Length of the scale bar over the organ's size, before it is rounded."""
 FRAMES = 72

@@ -8,8 +8,11 @@ import pytest
 import torch
 
 from surgisoft.errors import InputError
+from surgisoft.scene import mesh
+from surgisoft.scene import spec as scene_spec
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.circle_ablation import CircleAblationConfig
+from surgisoft.tasks.episodes import parts
 from surgisoft.tasks.episodes.file import load_episode, save_episode
 from surgisoft.tasks.episodes.log import EpisodeLog, EpisodeRecorder, find_events
 from surgisoft.tasks.episodes.parts import ArmLog, BeamLog, DoseLog
@@ -289,3 +292,8 @@ def test_a_body_without_a_scene_is_in_the_log():
     line = log.arms["arm"].line_mm[-1]
     apart = np.linalg.norm(surface[:, None] - line, axis=2).min() - log.arms["arm"].radius_mm
     assert 0.0 < log.clearance_mm[-1] < apart + 0.5
+
+
+def test_logs_know_the_roles_and_tools_of_scenes():
+    assert parts.ROLES == mesh.ROLES
+    assert parts.TOOLS == scene_spec.TOOLS

@@ -28,6 +28,7 @@ from scipy.special import ndtr
 from torch import Tensor
 
 from surgisoft.diagnosis.candidates import Signals, more_of, sensitivities_of, signals
+from surgisoft.diagnosis.cross_validation import INDUCING
 from surgisoft.diagnosis.design.schedules import REFERENCE, draw_run, limits_within
 from surgisoft.diagnosis.discrepancy import body_covariance, kernel
 from surgisoft.diagnosis.residuals import noise_of
@@ -47,8 +48,6 @@ FORM_S = 20.0
 """Time over which what it misses stays alike, s: the blocks of time that a diagnosis holds out."""
 ROOM = 2.0
 """Factor on the validated error that is allowed for."""
-INDUCING = 120
-"""Inducing points of the model discrepancy."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,7 +31,12 @@ from surgisoft.measurement.importing.ready_maps import READY_MAPS
 from surgisoft.measurement.importing.rotation import parse_rotation
 from surgisoft.measurement.recordings import ArmInfo
 from surgisoft.measurement.recordings.columns import MM_PER
-from surgisoft.measurement.recordings.sidecar import GravityTable, RecordingTable, Sidecar
+from surgisoft.measurement.recordings.sidecar import (
+    UNIT_VECTOR,
+    GravityTable,
+    RecordingTable,
+    Sidecar,
+)
 from surgisoft.measurement.units import check_conversion
 
 
@@ -75,9 +80,6 @@ PERMUTATION = Rule(
     "each of the numbers 0, 1, ... once", lambda order: sorted(order) == [*range(len(order))]
 )
 NUMBERS = Rule("numbers >= 0", lambda some: min(some, default=0) >= 0)
-UNIT_VECTOR = Rule(
-    "three numbers, a unit vector", lambda vector: bool(abs(np.linalg.norm(vector) - 1) <= 0.01)
-)
 
 
 @dataclass(frozen=True)

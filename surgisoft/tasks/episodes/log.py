@@ -22,11 +22,12 @@ from surgisoft.tasks.episodes.parts import (
     DoseLog,
     Event,
 )
+from surgisoft.tasks.world.arm import radius_mm
 from surgisoft.tasks.world.respiration import MOVING
 from surgisoft.tasks.world.scene import ObstacleEngine, SceneEngine
 
-NO_DIAMETER_MM = 15.0
-"""Outer diameter (mm) of an arm where neither scene nor model states it: the paper's arm."""
+JUMP_MM = 3.0
+"""A target that moves farther than this in one step has jumped: no line is drawn (mm)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,7 +293,7 @@ class EpisodeRecorder:
         if world.scene is not None:
             radius = world.scene.geometry.radius_mm(name)
         else:
-            radius = 0.5 * (arm.model.spec.diameter_mm or NO_DIAMETER_MM)
+            radius = radius_mm(arm.model)
         pressure = rows[f"{name}/pressure"]
         return ArmLog(
             command_kPa=rows[f"{name}/command"],

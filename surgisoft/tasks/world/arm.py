@@ -36,6 +36,14 @@ STAND_IN_KPA = 70.0
 """Range of pressures that stands for the widest range of an actuation that is no pressure, kPa:
 about that of the package's arm (69 kPa), for which the limits and noises of the tasks are made."""
 
+NO_DIAMETER_MM = 15.0
+"""Outer diameter of an arm where neither scene nor model states it, mm: that of the paper's arm."""
+
+
+def radius_mm(model: ArmModel) -> float:
+    """Outer radius of an arm outside of a scene, mm."""
+    return 0.5 * (model.spec.diameter_mm or NO_DIAMETER_MM)
+
 
 @dataclass(frozen=True)
 class Pneumatics:

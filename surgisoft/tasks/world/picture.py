@@ -13,7 +13,7 @@ from surgisoft.scene.camera import Camera
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.mesh import Body, Mesh
 from surgisoft.scene.render import Renderer
-from surgisoft.tasks.world.plate import NO_DIAMETER_MM
+from surgisoft.tasks.world.arm import radius_mm
 from surgisoft.tasks.world.scene import SceneEngine
 from surgisoft.tasks.world.world import World, WorldState
 
@@ -38,10 +38,7 @@ class WorldPicture:
         self._world = world
         scene = world.scene
         bodies = (_floor(),) if scene is None else scene.geometry.bodies
-        self._radii = {
-            name: 0.5 * (arm.model.spec.diameter_mm or NO_DIAMETER_MM)
-            for name, arm in world.arms.items()
-        }
+        self._radii = {name: radius_mm(arm.model) for name, arm in world.arms.items()}
         if scene is not None:
             self._radii |= {name: float(r) for name, r in scene.geometry.radii_mm.items()}
         rest = [

@@ -12,7 +12,7 @@ from torch import Tensor
 from surgisoft.errors import InputError
 from surgisoft.scene.mesh import Body
 from surgisoft.scene.plate import SlottedPlate
-from surgisoft.tasks.world.arm import Arm, Mounted
+from surgisoft.tasks.world.arm import Arm, Mounted, radius_mm
 from surgisoft.tasks.world.scene import ObstacleEngine
 from surgisoft.tasks.world.world import World, WorldConfig, named_arm, single_arm_world
 
@@ -22,8 +22,6 @@ EDGE = 0.05
 """Margin at either end of a chamber's range that targets leave for hysteresis, as a share of it."""
 ROUTE_POINTS = 9
 """Shapes on the route from the arm at rest to a target."""
-NO_DIAMETER_MM = 15.0
-"""Thickness (mm) of an arm whose model does not state it: that of the paper's arm."""
 
 
 def plate_world(
@@ -50,7 +48,7 @@ def plate_world(
     pose = np.eye(4)
     pose[:2, 3] = [np.interp(height_mm, line[:, 2], line[:, k]) for k in range(2)]
     pose[2, 3] = height_mm
-    radii = {"arm": 0.5 * (model.spec.diameter_mm or NO_DIAMETER_MM)}
+    radii = {"arm": radius_mm(model)}
     bodies = (Body("plate", "keep-out", plate.mesh(), pose),)
     engine = ObstacleEngine(bodies, radii, config.scene_engine.geometry, device, clearance_mm)
     return World({"arm": Mounted(model, torch.eye(4))}, config, engine, device)

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.diagnosis.robots import Recorded
 from surgisoft.diagnosis.amend import amend
 from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.residuals import EVERY_ROW, problem_of
@@ -36,14 +35,23 @@ class Amended:
         return (self.before - self.after) / (self.before - self.oracle)
 
 
-def amended(model: ArmModel, recorded: Recorded, effects: tuple[str, ...]) -> Amended:
-    """Amend a model by effects and compare with the oracle."""
-    before = after = locked_error(model, recorded.recording)
+def amended(
+    model: ArmModel,
+    recording: Recording,
+    plain: Recording,
+    effects: tuple[str, ...],
+    earlier: list[Recording] | None = None,
+) -> Amended:
+    """Amend a model by effects that a recording shows, and compare with the oracle.
+
+    plain: the same schedule and noise without hidden effects; earlier: recordings from before the
+    change, as `amend --before` takes them.
+    """
+    before = after = locked_error(model, recording)
     if effects:
-        found = amend(model, [recorded.recording], list(effects))
-        fall = found.held_out
+        found = amend(model, [recording], list(effects), before=earlier)
+        fall = found.model_error or found.held_out
         before, after = fall.before, fall.after if found.claimed else fall.before
-    plain = recorded.plain
     oracle = retune(model, problem_of(model, [plain], part="training")).model
     return Amended(effects, before, after, locked_error(oracle, plain))
 

@@ -82,7 +82,8 @@ def run_case(case: Case, folder: Path, amending: bool = False) -> Outcome:
     if verdict.kind == "ambiguous":
         settled, untouched = settle_both(case, model, known, recorded.recording, verdict.effects)
     if amending:
-        worth = amended(model, recorded, _answer(verdict.kind, verdict.effects, settled))
+        named = _answer(verdict.kind, verdict.effects, settled)
+        worth = amended(model, recorded.recording, recorded.plain, named)
     return Outcome(
         case=case,
         kind=verdict.kind,

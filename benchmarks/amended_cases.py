@@ -1,0 +1,200 @@
+"""Fall of the error by `amend` on generators of robots that took no part in the decision's fit.
+
+    python -m benchmarks.amended_cases chain=FOLDER elastica=FOLDER [--models FOLDER]
+        [--pairs] [--log FILE]
+
+FOLDER holds the cases of `benchmarks.chain_cases` or `benchmarks.elastica_cases`. The decision in
+force judges the stored evidence of each case (`benchmarks/decision/evidence/judged`); a source that
+the decision was fitted to is judged by a fit without it. Where one effect is missing that changes
+the key points by at least the model's validated error, and the decision names something, the
+robot's model is amended by it, as `surgisoft amend MODEL --effect NAME --data AFTER --before BEFORE`
+does: by the effect that is named alone, by both of two, by the more probable one of a set.
+
+The oracle is the error of the same model on the same robot, schedule and noise with nothing hidden
+(`benchmarks.diagnosis.amend`). Its share compares two falls of the error on the held-out quarter:
+that by `amend`, 0 where it claims none, and that by taking the effect out of the robot.
+"""
+
+import argparse
+import dataclasses
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from benchmarks import chain_cases, elastica_cases
+from benchmarks.decision.evidence_log import EVIDENCE, JUDGED, Labelled, read, stored
+from benchmarks.decision.fit import NAMING, fit, model_of
+from benchmarks.decision.folders import model_folder, robot_folder
+from benchmarks.decision.table import Judged, judged
+from benchmarks.diagnosis.after_table import SHOWS
+from benchmarks.diagnosis.amend import Amended, amended
+from benchmarks.rig_cases import TAKES, Generator, after_protocol
+from surgisoft.diagnosis.decision import fitted_decision
+from surgisoft.errors import InputError
+from surgisoft.measurement.recordings import Recording, load_recordings
+from surgisoft.surrogate.checkpoint import load_model
+
+GENERATORS = {"chain": chain_cases.GENERATOR, "elastica": elastica_cases.GENERATOR}
+"""Generators by the first word of the name of their evidence."""
+
+
+@dataclass(frozen=True)
+class Worth:
+    """What an amendment by the named effects was worth."""
+
+    case: str
+    """Name of the case."""
+    truth: tuple[str, ...]
+    """The missing effects."""
+    kind: str
+    """Kind of the result."""
+    amended: Amended
+    """The errors, mm."""
+
+    @property
+    def right(self) -> bool:
+        """Whether the model was amended by what is missing and by nothing else."""
+        return set(self.amended.effects) == set(self.truth)
+
+
+def statements(source: str) -> list[Judged]:
+    """What the decision says of the stored cases of a source that took no part in its fit."""
+    aside = stored(EVIDENCE / JUDGED)
+    if source in aside:
+        return judged(aside[source], fitted_decision())
+    every = stored()
+    if source not in every:
+        names = ", ".join((*aside, *every))
+        raise InputError(f"{source}: no stored evidence of that name; there is {names}")
+    others = [case for name, some in every.items() if name != source for case in some]
+    return judged(every[source], model_of(fit(others)))
+
+
+def to_amend(some: Sequence[Judged], effects: int) -> list[tuple[Labelled, str, tuple[str, ...]]]:
+    """(case, kind, effects to amend by) of the cases that are judged.
+
+    effects: number of effects that are missing.
+    """
+    answer = []
+    for one in some:
+        case, found = one.case, one.decision
+        if case.label != "known" or case.left_out or len(case.truth) != effects:
+            continue
+        if case.size < 1.0 or found.kind not in NAMING:
+            continue
+        chance = found.probabilities.effects
+        named = tuple(sorted(found.effects, key=lambda name: -chance.get(name, 0.0)))
+        answer.append((case, found.kind, named[:1] if found.kind == "ambiguous" else named))
+    return answer
+
+
+def unchanged(generator: Generator, case: Labelled, after: str) -> Recording:
+    """The recording of a case with nothing hidden: the same robot, schedule and noise."""
+    plan, _, number = Path(case.case).name.rpartition("-")
+    take = TAKES[plan or "round"] + int(number)
+    rig = generator.rig(int(case.robot), take=take)
+    return rig.record(after_protocol(generator, rig, int(case.robot), after))[0]
+
+
+def worth_of(
+    generator: Generator, folder: Path, models: Path, case: Labelled, named: tuple[str, ...]
+) -> Amended:
+    """Amend the model of a case's robot by the named effects, and compare with the oracle."""
+    place = folder / case.case
+    after = json.loads((place / "truth.json").read_text())["after"]
+    return amended(
+        load_model(model_folder(folder, case.robot, models)),
+        load_recordings(place / "after")[0],
+        unchanged(generator, case, after),
+        named,
+        load_recordings(robot_folder(folder, case.robot) / "before"),
+    )
+
+
+def markdown(some: dict[str, list[Worth]]) -> str:
+    """The tables: shares of each source, and each case."""
+    lines = [
+        "| source | cases | share of the oracle's fall, median | pooled | amended by what is "
+        "missing alone | their median | pooled |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for source, worths in some.items():
+        shown = [w for w in worths if w.amended.before >= SHOWS * w.amended.oracle]
+        right = [w for w in shown if w.right]
+        lines.append(
+            f"| {source} | {len(shown)} | {_shares(shown)} | {len(right)} | {_shares(right)} |"
+        )
+    lines += [
+        "",
+        "| source | case | missing | said | amended by | before | after | oracle | share |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for source, worths in some.items():
+        for w in sorted(worths, key=lambda w: w.amended.share):
+            a = w.amended
+            share = f"{100 * a.share:.0f} %" if a.before >= SHOWS * a.oracle else "-"
+            lines.append(
+                f"| {source} | {w.case} | {' + '.join(w.truth)} | {w.kind} | "
+                f"{' + '.join(a.effects)} | {a.before:.3f} | {a.after:.3f} | {a.oracle:.3f} | "
+                f"{share} |"
+            )
+    return "\n".join(lines)
+
+
+def _shares(some: Sequence[Worth]) -> str:
+    if not some:
+        return "- | -"
+    falls = np.array([[w.amended.before - w.amended.after for w in some], _best(some)])
+    middle = np.median([w.amended.share for w in some])
+    return f"{100 * middle:.0f} % | {100 * falls[0].sum() / falls[1].sum():.0f} %"
+
+
+def _best(some: Sequence[Worth]) -> list[float]:
+    return [w.amended.before - w.amended.oracle for w in some]
+
+
+def read_log(log: Path) -> dict[tuple[str, str], Worth]:
+    """Stored results by source and case."""
+    found = {}
+    for line in log.read_text().splitlines() if log.is_file() else []:
+        values = json.loads(line)
+        about = values["amended"]
+        a = Amended(**about | {"effects": tuple(about["effects"])})
+        one = Worth(values["case"], tuple(values["truth"]), values["kind"], a)
+        found[values["source"], one.case] = one
+    return found
+
+
+def main() -> None:
+    """Parse the command line, amend, and print the tables."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("cases", nargs="+", help="NAME=FOLDER, NAME as of the stored evidence")
+    parser.add_argument("--models", type=Path, default=Path("runs/benchmark-decision/models"))
+    parser.add_argument("--log", type=Path, default=Path("runs/amended-cases.jsonl"))
+    parser.add_argument("--pairs", action="store_true", help="cases of two effects")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    done, answer = read_log(given.log), {}
+    given.log.parent.mkdir(parents=True, exist_ok=True)
+    for name, _, folder in (each.partition("=") for each in given.cases):
+        generator = GENERATORS[name.partition("_")[0]]
+        answer[name] = []
+        wanted = to_amend(statements(name), 2 if given.pairs else 1)
+        for number, (case, kind, named) in enumerate(wanted):
+            one = done.get((name, case.case))
+            if one is None or one.amended.effects != named:
+                result = worth_of(generator, Path(folder), given.models, case, named)
+                one = Worth(case.case, case.truth, kind, result)
+                with given.log.open("a") as file:
+                    file.write(json.dumps({"source": name} | dataclasses.asdict(one)) + "\n")
+            answer[name].append(one)
+            print(f"{name}: {number + 1} of {len(wanted)}", flush=True)
+    print(markdown(answer))
+
+
+if __name__ == "__main__":
+    main()

@@ -7,8 +7,8 @@ FOLDER holds the cases of `benchmarks.chain_cases` or `benchmarks.elastica_cases
 force judges the stored evidence of each case (`benchmarks/decision/evidence/judged`); a source that
 the decision was fitted to is judged by a fit without it. Where one effect is missing that changes
 the key points by at least the model's validated error, and the decision names something, the
-robot's model is amended by it, as `surgisoft amend MODEL --effect NAME --data AFTER --before BEFORE`
-does: by the effect that is named alone, by both of two, by the more probable one of a set.
+robot's model is amended as by `surgisoft amend MODEL --effect NAME --data AFTER --before BEFORE`:
+by the effect that is named alone, by both of two, by the more probable one of a set.
 
 The oracle is the error of the same model on the same robot, schedule and noise with nothing hidden
 (`benchmarks.diagnosis.amend`). Its share compares two falls of the error on the held-out quarter:
@@ -26,7 +26,7 @@ import numpy as np
 import torch
 
 from benchmarks import chain_cases, elastica_cases
-from benchmarks.decision.evidence_log import EVIDENCE, JUDGED, Labelled, read, stored
+from benchmarks.decision.evidence_log import EVIDENCE, JUDGED, Labelled, stored
 from benchmarks.decision.fit import NAMING, fit, model_of
 from benchmarks.decision.folders import model_folder, robot_folder
 from benchmarks.decision.table import Judged, judged

@@ -83,14 +83,10 @@ class Walk:
 
 def run(line: str) -> None:
     """A command of the package, in this process."""
-    from surgisoft.cli import main
+    from surgisoft.cli import run as command
 
-    sys.argv = [PACKAGE, *line.split()]
-    try:
-        main()
-    except SystemExit as end:
-        if end.code:
-            raise
+    if code := command(line.split()):
+        raise SystemExit(code)
 
 
 def step_of_a_task() -> Callable[[], object]:

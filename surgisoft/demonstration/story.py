@@ -30,6 +30,7 @@ from surgisoft.replay.model_error import write_compared, write_models
 from surgisoft.replay.show import open_replay
 from surgisoft.report import Command, Page, Part, Picture, Section, Text, write_page
 from surgisoft.surrogate.checkpoint import save_model
+from surgisoft.workers import ONE_THREAD, torch_threads
 
 FOLDER = "surgisoft_demo"
 """Default folder of the demonstration."""
@@ -73,6 +74,7 @@ class Demonstration:
     """Result of each step in one sentence, by its name."""
 
 
+@torch_threads(1)
 def demo(
     folder: str | Path = FOLDER,
     *,
@@ -86,7 +88,8 @@ def demo(
     compilation, and the picture of the cut need not wait for it. Every file is written whole.
     policy: the training run of `circle_ablation` that cuts the ring; by default the one of the
     package. on_step: called with name and result of each step. Raises InputError where the folder
-    is not empty or cannot be written.
+    is not empty or cannot be written. This process and the one that records compute on one thread
+    each: the tensors of one episode are too small for two.
     """
     folder = Path(folder)
     _claim(folder)
@@ -189,7 +192,12 @@ def _recorder(file: Path) -> Iterator[Callable[[], None]]:
     command = [sys.executable, "-m", "surgisoft", *_collect_arguments(str(file))]
     quiet = subprocess.DEVNULL
     child = subprocess.Popen(
-        command, stdin=quiet, stdout=quiet, stderr=subprocess.PIPE, encoding="utf-8"
+        command,
+        stdin=quiet,
+        stdout=quiet,
+        stderr=subprocess.PIPE,
+        encoding="utf-8",
+        env=os.environ | dict.fromkeys(ONE_THREAD, "1"),
     )
 
     def wait() -> None:

@@ -35,7 +35,7 @@ test: $(STAMP)  ## the whole suite
 	$(BIN)/python -m pytest -n 2 -q
 
 fast: $(STAMP)  ## the tests that are not marked slow
-	$(BIN)/python -m pytest -n 2 --dist loadfile -q -m fast
+	$(BIN)/python -m pytest -n 2 -q -m fast
 
 coverage: $(STAMP)  ## branches that the suite takes, by part, as docs/results/coverage.md
 	rm -rf .coverage && mkdir .coverage

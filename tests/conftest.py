@@ -1,5 +1,8 @@
 """Settings that hold for every test: one thread, seeds, slow tests, and where measured data may be.
 
+The tests of a file run in one process, so that its fixtures are made once; files with much work run
+first, so that the last ones are short and no process waits for another at the end.
+
 `slow.txt` lists the tests that take at least SLOW_S of processor time; `pytest -m fast` runs the
 others. The list is written by
 
@@ -37,10 +40,14 @@ def pytest_addoption(parser):
 
 
 def pytest_collection_modifyitems(items):
-    """Mark each test `slow` or `fast`."""
-    slow = {line.split()[0] for line in SLOW.read_text().splitlines()}
+    """Mark each test `slow` or `fast`; put the files with the most processor time first."""
+    slow = dict(line.split() for line in SLOW.read_text().splitlines())
+    work: dict[str, float] = defaultdict(float)
+    for name, time in slow.items():
+        work[name.partition("::")[0]] += float(time)
     for item in items:
         item.add_marker(pytest.mark.slow if _function(item) in slow else pytest.mark.fast)
+    items.sort(key=lambda item: -work[item.nodeid.partition("::")[0]])
 
 
 @pytest.hookimpl(wrapper=True)

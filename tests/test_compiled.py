@@ -30,3 +30,33 @@ def test_an_index_that_names_a_class_of_before_is_written_anew(tmp_path):
     index.write_bytes(pickle.dumps(numba.__version__) + gone)
     again = run(script)
     assert (again.stdout, again.returncode) == ("42\n", 0), again.stderr
+
+
+INNER = """from surgisoft.compiled import compiled
+
+@compiled(inner=True)
+def double(x):
+    return x + x
+
+@compiled
+def quadruple(x):
+    return double(double(x))
+
+print(quadruple(5), quadruple(0.5))
+for given in (5, "text"):
+    try:
+        double(given)
+    except TypeError as error:
+        print(error)
+"""
+
+
+def test_a_function_without_an_entry_from_python_says_so(tmp_path):
+    """Compiled in this run, and loaded from disk in the next; it would end the process."""
+    script = tmp_path / "kernels.py"
+    script.write_text(INNER)
+    for _ in range(2):
+        done = run(script)
+        first, *errors = done.stdout.splitlines()
+        assert (first, done.returncode) == ("20 2.0", 0), done.stderr
+        assert errors == ["double is called by compiled functions only (inner=True)"] * 2

@@ -217,7 +217,7 @@ def times(one: np.ndarray, two: np.ndarray, out: np.ndarray) -> None:
             out[i, j] = one[i, 0] * two[0, j] + one[i, 1] * two[1, j] + one[i, 2] * two[2, j]
 
 
-@compiled
+@compiled(inner=True)
 def mean_load(plant: Plant, state: State) -> float:
     """Mean pressure of the chambers over their limit [-]."""
     total = 0.0
@@ -253,13 +253,15 @@ def place_links(plant: Plant, state: State) -> None:
         for d in range(3):
             state.joints[k, d] = state.nodes[k, d] + reach * frame[d, 2]
         times(frame, half, middle)
-        state.frames[k] = middle
+        for d in range(3):
+            for e in range(3):
+                state.frames[k, d, e] = middle[d, e]
         times(middle, half, frame)
         for d in range(3):
             state.nodes[k + 1, d] = state.joints[k, d] + reach * frame[d, 2]
 
 
-@compiled
+@compiled(inner=True)
 def load_links(plant: Plant, state: State) -> None:
     """Couples and force on every joint by weight and by the post, into state.stress."""
     count = plant.mass.shape[0]

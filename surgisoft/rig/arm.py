@@ -137,7 +137,7 @@ def remember(robot: Robot, pressures: np.ndarray, thrusts: np.ndarray, memory: M
     return taken < 50
 
 
-@compiled
+@compiled(inner=True)
 def friction_forces(friction: Friction, memory: Memory, forces: np.ndarray) -> None:
     """(J,) friction force of each line [N], into `forces`; positive while its strain rises."""
     for j in range(forces.shape[0]):
@@ -147,7 +147,7 @@ def friction_forces(friction: Friction, memory: Memory, forces: np.ndarray) -> N
         )  # fmt: skip
 
 
-@compiled
+@compiled(inner=True)
 def add_line_forces(friction: Friction, forces: np.ndarray, active: np.ndarray) -> None:
     """Add the lines' tension (J,) [N] to the internal loads (K, 4) [N, N mm] of the wall.
 
@@ -186,7 +186,8 @@ def settle_path(
         chamber_thrusts(robot.rod, path[t], thrusts)
         if not balance(robot.rod, loads, 1.0, thrusts, robot.rod.base, shape):
             return False
-        tips[t] = shape.centres[-1]
+        for d in range(3):
+            tips[t, d] = shape.centres[-1, d]
     return True
 
 

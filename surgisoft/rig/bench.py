@@ -188,7 +188,7 @@ def rest(plant: Plant, state: State) -> None:
     state.shape.status[:] = 0.0
 
 
-@compiled
+@compiled(inner=True)
 def advance(plant: Plant, state: State, steps: int, tape: np.ndarray, at: int) -> int:
     """Advance pumps and wall by `steps` controller periods.
 
@@ -226,7 +226,7 @@ def advance(plant: Plant, state: State, steps: int, tape: np.ndarray, at: int) -
     return at
 
 
-@compiled
+@compiled(inner=True)
 def take_shape(plant: Plant, state: State) -> bool:
     """Solve the arm's equilibrium under the present pressures and memory; False on failure."""
     robot, effects, active = plant.robot, plant.effects, state.shape.active
@@ -242,7 +242,7 @@ def take_shape(plant: Plant, state: State) -> bool:
     return balance(robot.rod, plant.loads, softness, state.thrusts, state.base, state.shape)
 
 
-@compiled
+@compiled(inner=True)
 def look_at(
     plant: Plant, state: State, tape: np.ndarray, at: int, frames: Frames, index: int
 ) -> int:
@@ -261,9 +261,12 @@ def look_at(
     for p in range(shape.centres.shape[0]):
         circle_centre(tracking.seen[p], frames.points[index, p])
         circle_centre(tracking.clean[p], frames.clean[index, p])
-    frames.centres[index] = shape.centres
+    for p in range(shape.centres.shape[0]):
+        for d in range(3):
+            frames.centres[index, p, d] = shape.centres[p, d]
     carry_mount(effects, time, frames.centres[index : index + 1])
-    frames.chamber[index] = state.chamber
+    for i in range(len(state.chamber)):
+        frames.chamber[index, i] = state.chamber[i]
     frames.temperature[index] = math.floor(10.0 * room_temperature(time) + 0.5) / 10.0
     return at
 
@@ -285,9 +288,10 @@ def run_commands(
     sample; tape: standard normals (tape_of_pause + count * tape_of_sample for each row); frames:
     room for P * count frames.
     """
-    at = 0
+    at = np.int64(0)
     for point in range(commands.shape[0]):
-        state.target[:] = commands[point]
+        for i in range(len(state.target)):
+            state.target[i] = commands[point, i]
         for k in range(-1 if pause > 0 else 0, count):
             at = advance(plant, state, pause if k < 0 else steps, tape, at)
             if at < 0:

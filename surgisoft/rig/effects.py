@@ -139,7 +139,7 @@ def forget(history: History) -> None:
     history.peak[:] = 0.0
 
 
-@compiled
+@compiled(inner=True)
 def shown_pressure(effects: Effects, gas: np.ndarray, column: int, i: int) -> float:
     """Pressure [kPa] at sensor i; a multiplexer that settles slowly mixes in the channel before."""
     pressure = gas[i, column]
@@ -148,7 +148,7 @@ def shown_pressure(effects: Effects, gas: np.ndarray, column: int, i: int) -> fl
     return pressure + effects.crosstalk * (gas[i - 1, column] - pressure)
 
 
-@compiled
+@compiled(inner=True)
 def effective_pressures(
     effects: Effects,
     time: float,
@@ -238,7 +238,7 @@ def add_effect_forces(
             forces[j] += math.copysign(effects.stiffening * curve, strain)
 
 
-@compiled
+@compiled(inner=True)
 def add_twist(effects: Effects, effective: np.ndarray, active: np.ndarray) -> None:
     """Torque of fibres wound unequally, growing faster than pressure, into active (K, 4) [N mm]."""
     torque = 0.0
@@ -256,11 +256,12 @@ def room_temperature(time: float) -> float:
     return 22.0 + warm + 1.0 * math.sin(2.0 * math.pi * time / 1300.0)
 
 
-@compiled
+@compiled(inner=True)
 def drifted_base(effects: Effects, time: float, base: np.ndarray, out: np.ndarray) -> None:
     """Base quaternion (4,) at a time [s]: the bracket yields like a saturating power law, and is
     knocked aside at one moment."""
-    out[:] = base
+    for i in range(4):
+        out[i] = base[i]
     grown = (time / 600.0) ** 0.6
     share = 1.3 * grown / (1.0 + 0.3 * grown)
     aside = 1.0 if time >= effects.knock[3] else 0.0
@@ -279,7 +280,7 @@ def drifted_base(effects: Effects, time: float, base: np.ndarray, out: np.ndarra
     out[3] = w * d + x * c - y * b + z * a
 
 
-@compiled
+@compiled(inner=True)
 def valve_shut(effects: Effects, time: float, i: int):
     """Whether the valve of chamber i is stuck shut at a time [s]."""
     if i != effects.jammed:
@@ -288,7 +289,7 @@ def valve_shut(effects: Effects, time: float, i: int):
     return k >= 0 and time < effects.jam[k, 1]
 
 
-@compiled
+@compiled(inner=True)
 def carry_mount(effects: Effects, time: float, points: np.ndarray) -> None:
     """Shift points (n, k, 3) [mm] in place with a mount that lies on a breathing body. time: [s].
 
@@ -298,11 +299,13 @@ def carry_mount(effects: Effects, time: float, points: np.ndarray) -> None:
         return
     phase = math.pi * (time - effects.breath[4]) / effects.breath[3]
     share = math.cos(phase) ** BREATH_POWER
-    for d in range(3):
-        points[:, :, d] += share * effects.breath[d]
+    for p in range(points.shape[0]):
+        for k in range(points.shape[1]):
+            for d in range(3):
+                points[p, k, d] += share * effects.breath[d]
 
 
-@compiled
+@compiled(inner=True)
 def slip_marker(
     effects: Effects, time: float, frames: np.ndarray, history: History, markers: np.ndarray
 ) -> None:
@@ -324,7 +327,7 @@ def slip_marker(
         marker[d] += history.slipped[0] * frames[plane, d, 2]
 
 
-@compiled
+@compiled(inner=True)
 def misalign(effects: Effects, points: np.ndarray) -> None:
     """Points (n, k, 3) [mm] as cameras with a wrong calibration place them; in place.
 
@@ -336,7 +339,8 @@ def misalign(effects: Effects, points: np.ndarray) -> None:
         return
     axis = np.zeros(3)
     if angle > 0.0:
-        axis[:] = v[:3] / angle
+        for d in range(3):
+            axis[d] = v[d] / angle
     c, s = math.cos(angle), math.sin(angle)
     for p in range(points.shape[0]):
         for k in range(points.shape[1]):

@@ -248,7 +248,7 @@ def circle_centre(points: np.ndarray, out: np.ndarray) -> None:
         out[d] = mean[d] + cu * first[d] + cv * second[d]
 
 
-@compiled
+@compiled(inner=True)
 def _plane_normal(count, spread, normal):
     """Unit normal of the plane through `count` markers: of three exactly, of more by least squares.
 
@@ -256,7 +256,8 @@ def _plane_normal(count, spread, normal):
     """
     if count > 3:
         _, vectors = np.linalg.eigh(spread)
-        normal[:] = vectors[:, 0]
+        for d in range(3):
+            normal[d] = vectors[d, 0]
         return
     # The scatter matrix of three points has rank two: cross products of its rows are normal.
     best = 0.0

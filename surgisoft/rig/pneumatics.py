@@ -183,7 +183,7 @@ def fill(pumps: Pumps, row: np.ndarray, i: int, stretch: float) -> None:
     row[CHAMBER] = row[PRESSURE]
 
 
-@compiled
+@compiled(inner=True)
 def fill_through_valve(pumps: Pumps, row: np.ndarray, i: int, stretch: float, shut: bool) -> None:
     """Fill a chamber behind a valve: where it is shut, chamber and pump keep separate air."""
     near = row[X] * pumps.bore + pumps.tube[i]

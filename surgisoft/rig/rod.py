@@ -152,7 +152,7 @@ def _slope(rod, softness, thrusts, active, strain, k, nx, ny, nz, y, out):
     return found != NOT_CONVERGED
 
 
-@compiled
+@compiled(inner=True)
 def _keep_plane(shape, plane, y):
     a, b, c, d, e, f, g, h, i = _axes(y[3], y[4], y[5], y[6])
     shape.centres[plane, 0], shape.centres[plane, 1], shape.centres[plane, 2] = y[0], y[1], y[2]
@@ -162,7 +162,7 @@ def _keep_plane(shape, plane, y):
     frame[2, 0], frame[2, 1], frame[2, 2] = g, h, i
 
 
-@compiled
+@compiled(inner=True)
 def shoot(
     rod: Rod,
     loads: Loads,
@@ -184,8 +184,10 @@ def shoot(
     k1, k2, k3, k4 = np.empty(10), np.empty(10), np.empty(10), np.empty(10)
     _, _, c, _, _, f, _, _, i = _axes(base[0], base[1], base[2], base[3])
     y[0], y[1], y[2] = 0.0, 0.0, 0.0
-    y[3:7] = base
-    y[7:10] = unknown[:3]
+    for d in range(4):
+        y[3 + d] = base[d]
+    for d in range(3):
+        y[7 + d] = unknown[d]
     for plane in range(rod.planes.shape[0]):
         if rod.planes[plane] < 0:
             _keep_plane(shape, plane, y)
@@ -244,7 +246,7 @@ def shoot(
     return True
 
 
-@compiled
+@compiled(inner=True)
 def _support_force(loads, y):
     """Penalty force [N] of the support: zero when free, smooth over 0.02 mm at the touch."""
     normal = loads.support_normal
@@ -252,7 +254,7 @@ def _support_force(loads, y):
     return loads.support_stiffness * 0.5 * (depth + math.sqrt(depth * depth + 4e-4))
 
 
-@compiled
+@compiled(inner=True)
 def _close_at_tip(rod, loads, y, residual):
     """Moment left over at the tip cap [N mm]; y moves on to the tip plane."""
     a, b, c, d, e, f, g, h, i = _axes(y[3], y[4], y[5], y[6])
@@ -273,7 +275,7 @@ def _close_at_tip(rod, loads, y, residual):
     y[2] += i * rod.tip_cap
 
 
-@compiled
+@compiled(inner=True)
 def _jacobian(rod, loads, softness, thrusts, base, shape, residual):
     """Inverse of the residual's Jacobian by forward differences, into shape.inverse."""
     size = 4 if loads.support > 0 else 3
@@ -281,13 +283,17 @@ def _jacobian(rod, loads, softness, thrusts, base, shape, residual):
     moved = np.empty(4)
     other = np.empty(4)
     for column in range(size):
-        moved[:] = shape.unknown
+        for row in range(4):
+            moved[row] = shape.unknown[row]
         moved[column] += 1e-5
         if not shoot(rod, loads, softness, thrusts, base, moved, shape, other):
             return False
         for row in range(size):
             matrix[row, column] = (other[row] - residual[row]) / 1e-5
-    shape.inverse[:size, :size] = np.linalg.inv(matrix)
+    inverse = np.linalg.inv(matrix)
+    for row in range(size):
+        for column in range(size):
+            shape.inverse[row, column] = inverse[row, column]
     return True
 
 
@@ -328,7 +334,8 @@ def balance(
                 return False
             shape.status[0] = 1.0
             fresh = True
-        before[:] = shape.unknown
+        for row in range(4):
+            before[row] = shape.unknown[row]
         for row in range(size):
             step[row] = 0.0
             for column in range(size):
@@ -344,7 +351,8 @@ def balance(
             if scale < 1e-4:
                 return False
         if not good or _error(after) >= error:
-            shape.unknown[:] = before
+            for row in range(4):
+                shape.unknown[row] = before[row]
             shape.status[0] = 0.0
             continue
         _broyden(shape, step, scale, residual, after, size)
@@ -352,11 +360,12 @@ def balance(
         if _error(after) > 0.25 * error:
             shape.status[0] = 0.0
         error = _error(after)
-        residual[:] = after
+        for row in range(4):
+            residual[row] = after[row]
     return False
 
 
-@compiled
+@compiled(inner=True)
 def _broyden(shape, step, scale, residual, after, size):
     """Broyden's (1965) update of the inverse Jacobian: += (dx - B dF) dx^T B / (dx^T B dF)."""
     product = np.zeros(4)

@@ -62,7 +62,7 @@ def segments_d2(p, q, a, b):
     return dot3(x, y, z, x, y, z)
 
 
-@compiled
+@compiled(inner=True)
 def point_triangle(p, a, b, c):
     """Nearest point of triangle a b c to p: squared distance, barycentric (v, w) of b and c.
 
@@ -166,7 +166,7 @@ STACK = 64
 """Size of the stack of boxes in a traversal; twice the depth of a tree of 2^31 leaves."""
 
 
-@compiled
+@compiled(inner=True)
 def _select(order, key, start, stop, middle):
     """Reorder order[start:stop] so that keys below `middle` are no larger than those above.
 
@@ -248,7 +248,7 @@ def triangle(triangles, k):
     )
 
 
-@compiled
+@compiled(inner=True)
 def _segment_box_d2(p, q, low, high, lower, upper, node, slanting):
     """Lower bound of the squared distance between segment p q and a box: row `node` (2 N - 1, 3).
 
@@ -275,7 +275,7 @@ def _segment_box_d2(p, q, low, high, lower, upper, node, slanting):
     return apart
 
 
-@compiled
+@compiled(inner=True)
 def segment_surface_d2(p, q, bound2, tree, nodes, reach, slanting):
     """Squared distance from segment p q to the surface if below bound2, bound2 otherwise.
 
@@ -287,8 +287,8 @@ def segment_surface_d2(p, q, bound2, tree, nodes, reach, slanting):
     low = (min(p[0], q[0]), min(p[1], q[1]), min(p[2], q[2]))
     high = (max(p[0], q[0]), max(p[1], q[1]), max(p[2], q[2]))
     leaves = len(starts) - 1
-    nodes[0], reach[0] = 0, _segment_box_d2(p, q, low, high, lower, upper, 0, slanting)
-    size, best = 1, bound2
+    nodes[0], size, best = 0, 1, bound2
+    reach[0] = _segment_box_d2(p, q, low, high, lower, upper, nodes[0], slanting)
     while size > 0:
         size -= 1
         node = nodes[size]
@@ -311,14 +311,15 @@ def segment_surface_d2(p, q, bound2, tree, nodes, reach, slanting):
     return best
 
 
-@compiled
+@compiled(inner=True)
 def point_surface(p, bound2, triangles, starts, lower, upper):
     """Nearest triangle to p within bound2: squared distance, tree index (-1 for none), v, w."""
     leaves = len(starts) - 1
     nodes = np.empty(STACK, np.int64)
     reach = np.empty(STACK, np.float64)
-    nodes[0], reach[0] = 0, boxes_d2(p, p, lower, upper, 0)
-    size, best, face, best_v, best_w = 1, bound2, -1, 0.0, 0.0
+    nodes[0], size = 0, 1
+    reach[0] = boxes_d2(p, p, lower, upper, nodes[0])
+    best, face, best_v, best_w = bound2, -1, 0.0, 0.0
     while size > 0:
         size -= 1
         node = nodes[size]

@@ -41,7 +41,7 @@ def field_at(values, origin, cell, p):
     return near * (1 - u) + far * u
 
 
-@compiled
+@compiled(inner=True)
 def _crossings(p, q, triangles, starts, lower, upper):
     """How many faces the segment p q crosses."""
     low = (min(p[0], q[0]), min(p[1], q[1]), min(p[2], q[2]))
@@ -118,7 +118,7 @@ def _least_distance(value, band, slack, most):
     return min(max(band - 2.0 * slack, value - 9.0 * slack), most)
 
 
-@compiled
+@compiled(inner=True)
 def _from_afar(
     line, given, turn, shift, longest, values, origin, cell, band, slack, most, tree, bounds
 ):
@@ -158,7 +158,7 @@ def _from_afar(
     return estimate, least
 
 
-@compiled
+@compiled(inner=True)
 def _line_bounds(line, values_at, lows, values, origin, cell, band, slack):
     """Field values at the points (K,), and lower bounds of the segments' distances (K - 1,), mm.
 
@@ -435,7 +435,7 @@ def chains_folded(lines, radius, gap, horizon, out):
         out[n] = best - 2.0 * radius
 
 
-@compiled
+@compiled(inner=True)
 def _nearer(lines, n, i, j, best):
     """The distance (mm) between segments i and j of line n, or `best` where that is less."""
     d2 = segments_d2(

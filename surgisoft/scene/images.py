@@ -351,7 +351,7 @@ def draw_rows(
         )  # fmt: skip
 
 
-@compiled
+@compiled(inner=True)
 def _raster_body(m, bodies, number, focal, xs, ys, z, who, place, share, stack, planes):
     """Keep the faces of a body that are nearest at the pixels' centres.
 
@@ -440,7 +440,7 @@ def _raster_body(m, bodies, number, focal, xs, ys, z, who, place, share, stack, 
                         share[i, j, 0], share[i, j, 1] = of_b / total, of_c / total
 
 
-@compiled
+@compiled(inner=True)
 def _raster_arm(inward, chains, number, b, bodies, focal, xs, ys, z, who, place):
     """Keep the segments of an arm that are nearest at the pixels' centres; see `rays_to_chains`."""
     lines, firsts, radii, gaps, _ = chains
@@ -506,7 +506,7 @@ def _span(x, z, x2, z2, radius, focal, pixels):
     return max(0, math.ceil(low)), min(pixels - 1, math.floor(high))
 
 
-@compiled
+@compiled(inner=True)
 def _develop(
     b, cameras, lens, inside, film, bodies, chains, beams, tissue, xs, ys, z, who, place, share,
     rgb, labels
@@ -620,7 +620,7 @@ def _moved(m, x, y, z):
     )
 
 
-@compiled
+@compiled(inner=True)
 def _crossed(a, b):
     """Cross product of tuples; that of (b, a) is exactly its negative."""
     return (
@@ -630,7 +630,7 @@ def _crossed(a, b):
     )
 
 
-@compiled
+@compiled(inner=True)
 def _cofactors(m, out):
     """The cofactors of a map's linear part, which turn normals as the map turns surfaces."""
     for i in range(3):
@@ -639,7 +639,7 @@ def _cofactors(m, out):
             out[i, j] = m[r, t] * m[s, u] - m[r, u] * m[s, t]
 
 
-@compiled
+@compiled(inner=True)
 def _sample_near(tissue, x, y, z):
     """The nearest sample of the tissue's marks within SAMPLE_MM of a point; -1 for none."""
     _, samples, origin, cell, shape, starts = tissue[:6]
@@ -665,7 +665,7 @@ def _sample_near(tissue, x, y, z):
     return found
 
 
-@compiled
+@compiled(inner=True)
 def _stained(base, tint, heat, channel):
     """A tissue's linear colour with a lesion's tint and a dose's heat; see `render.stained`."""
     base += (LESION_LINEAR[channel] - base) * tint

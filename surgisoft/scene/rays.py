@@ -145,7 +145,7 @@ def _plane_hits(origins, directions, triangles, rays, faces, coarse):
     return out
 
 
-@compiled
+@compiled(inner=True)
 def capsule_entry(origin, d, a, b, radius):
     """Distance along the ray to capsule a b, inf for a miss; see `capsules.ray_capsule`."""
     ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
@@ -240,7 +240,7 @@ def aim_rays(origins, directions, origin, aim):
             origin[n, i] = origins[n, i]
 
 
-@compiled
+@compiled(inner=True)
 def _nearest_face(p, d, best, triangles, starts, lower, upper, nodes, entry):
     """Distance to and tree index of the first face on a ray before `best`; -1 for none."""
     leaves = len(starts) - 1
@@ -248,7 +248,8 @@ def _nearest_face(p, d, best, triangles, starts, lower, upper, nodes, entry):
     iy = 1.0 / d[1] if d[1] != 0.0 else 1e300
     iz = 1.0 / d[2] if d[2] != 0.0 else 1e300
     face = -1
-    nodes[0], entry[0], size = 0, _entry(p, ix, iy, iz, lower, upper, 0), 1
+    nodes[0], size = 0, 1
+    entry[0] = _entry(p, ix, iy, iz, lower, upper, nodes[0])
     while size > 0:
         size -= 1
         node = nodes[size]
@@ -276,7 +277,7 @@ def _nearest_face(p, d, best, triangles, starts, lower, upper, nodes, entry):
     return best, face
 
 
-@compiled
+@compiled(inner=True)
 def _entry(p, ix, iy, iz, lower, upper, node):
     """Where a ray enters a box, inf for a miss; rounding may not lose a box that it grazes."""
     one, two = (lower[node, 0] - p[0]) * ix, (upper[node, 0] - p[0]) * ix

@@ -99,7 +99,7 @@ class Renderer:
         pose = np.asarray(pose, dtype=np.float64)
         origin = pose[:3, 3]
         rays = self._rays @ pose[:3, :3].T
-        origins = np.broadcast_to(origin, rays.shape)
+        origins = np.tile(origin, (len(rays), 1))
         farthest = 4.0 * self._camera.range_mm[1]
         distance, face = self._surface.first_hit(origins, rays, farthest)
         points = origin + distance[:, None] * rays
@@ -128,9 +128,9 @@ class Renderer:
     def _draw_arm(self, shape: ArmShape, gap, origins, rays, distance, colour, normal) -> None:
         before, segment = distance.copy(), np.zeros((1, len(rays)), np.int64)
         rays_to_chains(
-            np.ascontiguousarray(origins)[None],
+            origins[None],
             rays[None],
-            shape.centreline_mm[None],
+            shape.centreline_mm[None].astype(np.float32),  # as simulations have it: one compilation
             shape.radius_mm,
             gap,
             distance[None],
@@ -190,19 +190,25 @@ def _smooth_normals(pixels, face, points, triangles, normals, out):
     """Normals (F, 3, 3) of the corners blended at the points met."""
     for n in pixels:
         f = face[n]
-        e1 = triangles[f, 1] - triangles[f, 0]
-        e2 = triangles[f, 2] - triangles[f, 0]
-        s = points[n] - triangles[f, 0]
-        a, b, c = (e1 * e1).sum(), (e1 * e2).sum(), (e2 * e2).sum()
-        d, e = (s * e1).sum(), (s * e2).sum()
+        a, b, c, d, e = 0.0, 0.0, 0.0, 0.0, 0.0
+        for i in range(3):
+            e1 = triangles[f, 1, i] - triangles[f, 0, i]
+            e2 = triangles[f, 2, i] - triangles[f, 0, i]
+            s = points[n, i] - triangles[f, 0, i]
+            a, b, c, d, e = a + e1 * e1, b + e1 * e2, c + e2 * e2, d + s * e1, e + s * e2
         area = a * c - b * b
         v, w = 0.0, 0.0
         if area > 0.0:
             v, w = (c * d - b * e) / area, (a * e - b * d) / area
-        blend = (1.0 - v - w) * normals[f, 0] + v * normals[f, 1] + w * normals[f, 2]
-        length = math.sqrt((blend * blend).sum())
+        length = 0.0
+        for i in range(3):
+            blend = (1.0 - v - w) * normals[f, 0, i] + v * normals[f, 1, i] + w * normals[f, 2, i]
+            out[n, i] = blend
+            length += blend * blend
         if length > 0.0:
-            out[n] = blend / length
+            length = math.sqrt(length)
+            for i in range(3):
+                out[n, i] /= length
 
 
 @compiled
@@ -212,18 +218,25 @@ def _glow(origin, rays, distance, beam, radius):
     By the nearest approach of the ray to the beam (Ericson 2005, section 5.1.8), as a Gaussian.
     """
     out = np.zeros(len(rays))
-    d2 = beam[1] - beam[0]
-    r = origin - beam[0]
-    e, f = (d2 * d2).sum(), (d2 * r).sum()
+    e, f = 0.0, 0.0
+    for i in range(3):
+        along = beam[1, i] - beam[0, i]
+        e, f = e + along * along, f + along * (origin[i] - beam[0, i])
     if e == 0.0:
         return out
     for n in range(len(rays)):
-        b, c = (rays[n] * d2).sum(), (rays[n] * r).sum()
+        b, c = 0.0, 0.0
+        for i in range(3):
+            b += rays[n, i] * (beam[1, i] - beam[0, i])
+            c += rays[n, i] * (origin[i] - beam[0, i])
         denominator = e - b * b
         s = (b * f - c * e) / denominator if denominator > 1e-12 * e else 0.0
         s = min(max(s, 0.0), distance[n] + radius)
         t = min(max((b * s + f) / e, 0.0), 1.0)
         s = min(max(b * t - c, 0.0), distance[n] + radius)
-        gap = r + s * rays[n] - t * d2
-        out[n] = math.exp(-2.0 * (gap * gap).sum() / (radius * radius))
+        gap2 = 0.0
+        for i in range(3):
+            gap = origin[i] - beam[0, i] + s * rays[n, i] - t * (beam[1, i] - beam[0, i])
+            gap2 += gap * gap
+        out[n] = math.exp(-2.0 * gap2 / (radius * radius))
     return out

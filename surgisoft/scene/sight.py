@@ -75,7 +75,7 @@ def _turned(t, x, y, z):
     )
 
 
-@compiled
+@compiled(inner=True)
 def _bundle(eye, ends, wanted, b):
     """Middle of the wanted ends of one camera's lines, and the radius of a ball around them."""
     x, y, z, count = 0.0, 0.0, 0.0, 0
@@ -156,7 +156,7 @@ def hide_behind_chain(eyes, ends, distance, short, lines, radius, gap, wanted, c
                     break
 
 
-@compiled
+@compiled(inner=True)
 def _meets(p, d, limit, triangles, starts, lower, upper, nodes):
     """Whether the ray from p along the unit vector d meets a face nearer than `limit`."""
     leaves = len(starts) - 1

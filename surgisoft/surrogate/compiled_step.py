@@ -324,7 +324,8 @@ def _advance_with_plays(
             scaled[m] = (chamber[m] - play_centre[m]) / play_half[m] * play_use[m]
         load[:] = np.float32(0.0)
         for m in range(chambers):
-            mixed[:] = linear[m]
+            for line in range(lines):
+                mixed[line] = linear[m, line]
             for other in range(chambers):
                 for line in range(lines):
                     mixed[line] += bent[m, other, line] * scaled[other]

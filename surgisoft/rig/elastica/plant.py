@@ -231,7 +231,8 @@ def rotate(turn: np.ndarray, vector: np.ndarray, out: np.ndarray) -> None:
     """Rotate a vector (3,) by a rotation vector (3,) [rad] (Rodrigues), into `out`."""
     angle = math.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
     if angle == 0.0:
-        out[:] = vector
+        for d in range(3):
+            out[d] = vector[d]
         return
     x, y, z = turn[0] / angle, turn[1] / angle, turn[2] / angle
     c, s = math.cos(angle), math.sin(angle)
@@ -251,7 +252,7 @@ def base_couple(plant: Plant, body: Body, couple: np.ndarray) -> None:
             couple[axis] += plant.base[d, axis] * body.internal_couple[d, 0]
 
 
-@compiled
+@compiled(inner=True)
 def slip_bracket(plant: Plant, state: State) -> None:
     """Let the base's bracket stick, or slip under the couple of the first inner node.
 
@@ -274,7 +275,7 @@ def slip_bracket(plant: Plant, state: State) -> None:
         state.slipped[1] += share * compliance * lack_y
 
 
-@compiled
+@compiled(inner=True)
 def load_wall(plant: Plant, state: State, loaded: np.ndarray, added: np.ndarray) -> None:
     """Set the rod's rest strains from chambers and wall; (2, N - 1) and (1, N) scratch.
 
@@ -364,7 +365,8 @@ def advance(plant: Plant, state: State, steps: int, on: bool) -> None:
             fill_chambers(plant.gas, state.air, plant.step, volumes)
         if plant.bracket[0] > 0.0:
             slip_bracket(plant, state)
-        before[:] = state.clamp
+        for d in range(3):
+            before[d] = state.clamp[d]
         place_base(plant, state.time[0], state.slipped, state.clamp, state.axes)
         for d in range(3):
             speed[d] = (state.clamp[d] - before[d]) / plant.step

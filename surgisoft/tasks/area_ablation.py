@@ -102,7 +102,7 @@ class AreaAblationConfig(LaserConfig):
 
     @property
     def at_lesion(self) -> bool:
-        """Whether the scene's lesion may be what is treated; not with outlines of one's own."""
+        """Whether the scene's lesion may be what is treated; not with given outlines."""
         return not self.outlines
 
     def __post_init__(self):

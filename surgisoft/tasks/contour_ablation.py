@@ -57,7 +57,7 @@ class ContourAblationConfig(LaserConfig):
 
     @property
     def at_lesion(self) -> bool:
-        """Whether the scene's lesion may be what is treated; not with contours of one's own."""
+        """Whether the scene's lesion may be what is treated; not with given contours."""
         return not self.contours
 
     def __post_init__(self):

@@ -42,7 +42,7 @@ SHORT = {
     "keyhole_ablation": {"way_mm": 20.0, "speed_mm_s": 20.0, "wait_s": 0.5},
     "two_laser_ring": {},
 }
-"""Fields that make an episode of a task short, and its feed begin within it."""
+"""Fields that make an episode of a task short, but not below 25 steps, and its feed begin in it."""
 AGREE_MM = 1e-4
 """Tolerance of an estimated key point."""
 ROUNDING_MM = {"keyhole_ablation": 1e-3, "two_laser_ring": 1e-3}

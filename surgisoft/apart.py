@@ -56,7 +56,7 @@ class Ended:
 
 
 def read_apart(module: str, path: Path, what: str) -> bytes:
-    """What `module.as_bytes(path)` gives in a process of its own.
+    """Result of `module.as_bytes(path)`, computed in a separate process.
 
     what: the kind of file in words. Raises the InputError that the reader raises there, or one
     where the process does not end well.

@@ -302,7 +302,7 @@ def _short(text: str, most: int = 100) -> str:
 
 
 def describe(value: object) -> str:
-    """What came, short enough for one line."""
+    """A value as text, short enough for one line of a message."""
     names = {bool: "boolean", int: "integer", float: "number", str: "text"}
     if isinstance(value, dict):
         return "a table"

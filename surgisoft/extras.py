@@ -48,7 +48,7 @@ WITH_SCENE = ("train", "replay", "segmentation")
 
 
 def missing_library(error: ModuleNotFoundError, use: str = "") -> str | None:
-    """What to install for a module that is missing, in one line; None where no extra has it.
+    """Advice what to install for a missing module, in one line; None where no extra has it.
 
     use: the command or function that needs it.
     """

@@ -34,7 +34,7 @@ class Processes:
 
     @property
     def rsl_rl(self) -> dict | None:
-        """What rsl-rl wants to know; None for a process alone."""
+        """Settings of the process group for rsl-rl; None for a process alone."""
         if self.count == 1:
             return None
         return {"global_rank": self.rank, "local_rank": self.local, "world_size": self.count}
@@ -56,7 +56,7 @@ class Processes:
         return held.item()
 
     def gather(self, value) -> list | None:
-        """What each process has, in the leader; None in the others."""
+        """Objects of all processes, in the leader; None in the others."""
         if self.count == 1:
             return [value]
         gathered = [None] * self.count if self.leads else None

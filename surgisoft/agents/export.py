@@ -115,7 +115,7 @@ def running(graph: ControllerGraph) -> Controller:
 
 
 def describe_controller(graph: ControllerGraph) -> dict[str, Any]:
-    """What `policy.json` says of a controller: names, order, units, scales and ranges."""
+    """Contents of `policy.json`: names, order, units, scales and ranges of a controller."""
     task, meanings = graph.task, goal_docs(graph.start.goal)
     leaves: list[dict[str, Any]] = [
         {"name": leaf.name, "first": leaf.first, "last": leaf.last, "shape": list(leaf.shape)}

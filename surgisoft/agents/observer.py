@@ -54,7 +54,7 @@ class ObserverGains:
 
 
 class Order(NamedTuple):
-    """What an action asks of the pumps for one step of a task."""
+    """Commands to the pumps for one step of a task."""
 
     target_kPa: Tensor
     """(B, m) kPa: pressures to command."""
@@ -86,7 +86,7 @@ class Observer:
             self.learner = DisturbanceEstimator(arm.model, dt_s, device=arm.device)
 
     def memory(self, count: int) -> Adaptation | None:
-        """What is known of the disturbance of `count` arms before the first measurement."""
+        """Prior of the disturbance of `count` arms, before the first measurement."""
         return None if self.learner is None else self.learner.start(count)
 
     def no_lead(self, points_mm: Tensor) -> Tensor | None:
@@ -105,7 +105,7 @@ class Observer:
         lowest: Tensor | None = None,
         highest: Tensor | None = None,
     ) -> Order:
-        """What to command for changes of pressure (B, m) kPa, and what should come of it.
+        """Commands for changes of pressure (B, m) kPa, and the predicted result.
 
         lowest, highest: (B, m) kPa, other limits of a command than those of the observer.
         """

@@ -158,7 +158,7 @@ class RigPlant:
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """What B rigs measure at one instant, float32."""
+    """Measurements of B rigs at one instant, float32."""
 
     pressure: Tensor
     """(B, m) kPa, as measured."""

@@ -165,7 +165,7 @@ def _copied_scene(plan: Plan, fresh: Path) -> dict | None:
 
 
 def versions() -> dict[str, str]:
-    """What the run was computed with."""
+    """Versions of the software that computed the run."""
     from importlib.metadata import version
 
     return {

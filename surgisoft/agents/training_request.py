@@ -23,7 +23,7 @@ from surgisoft.workers import torch_threads
 
 @dataclass(frozen=True)
 class TrainingRequest:
-    """What to train, before it is resolved to a `Plan`."""
+    """Request for a training, before it is resolved to a `Plan`."""
 
     task: str
     """Name of the task."""

@@ -165,7 +165,7 @@ def with_commands() -> typer.Typer:
 
 
 def left_behind(written: Sequence[Path]) -> str:
-    """What an interrupted command leaves, in words: each file is complete or absent."""
+    """Outputs that an interrupted command leaves, in words: each file is complete or absent."""
     there = [path for path in dict.fromkeys(written) if path.exists()]
     outer = [path for path in there if not any(other in path.parents for other in there)]
     if not outer:

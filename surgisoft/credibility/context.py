@@ -125,7 +125,7 @@ class Context:
         return self
 
     def source(self, name: str) -> Source | None:
-        """What is stated of a recording; None where nothing is."""
+        """The context's entry for a recording; None where it has none."""
         return next((source for source in self.sources if source.name == name), None)
 
 

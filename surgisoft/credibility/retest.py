@@ -95,7 +95,7 @@ class Repeated:
 
 @dataclass(frozen=True)
 class Told:
-    """What one recording alone says is missing."""
+    """Diagnosis of one recording alone."""
 
     recording: str
     """Name of the recording."""

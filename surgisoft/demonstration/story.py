@@ -56,7 +56,7 @@ STEPS = (
 
 @dataclass(frozen=True, eq=False)
 class Demonstration:
-    """What the five steps found, and where their page lies."""
+    """Results of the five steps, and the path of their page."""
 
     cut: Evaluations
     """Step 1: an episode of the trained policies."""
@@ -317,7 +317,7 @@ def _amended_parts(amendment: Amendment | None) -> list[Part]:
 
 
 def cut_sentence(cut: Evaluations) -> str:
-    """What the episode of one policy came to, in words."""
+    """Result of one policy's episode, in words."""
     (result,) = cut.results
     numbers = {name: value.mean for name, value in result.overall.items()}
     whole = numbers["success"] == 1.0

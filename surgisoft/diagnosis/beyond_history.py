@@ -49,7 +49,7 @@ not known better, and of next to nothing any line is all."""
 
 @dataclass(frozen=True, eq=False)
 class BeyondHistory:
-    """What a black box with memory leaves, and what breaks and lines explain of that."""
+    """Error that a black box with memory leaves, and the shares that breaks and lines explain."""
 
     losses: np.ndarray
     """(B,) held-out sum of squared distances by block of the black box, mm^2."""

@@ -128,7 +128,7 @@ def with_effect(model: ArmModel, name: str, effect: Effect) -> ArmModel:
 
 @dataclass(frozen=True, eq=False)
 class Signals:
-    """What the stages of a model see along a history, every row, and its slope on some."""
+    """Signals at the stages of a model along a history (all rows), and its slope (some rows)."""
 
     context: Context
     """Times and chamber pressure of every row."""

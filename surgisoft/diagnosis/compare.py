@@ -175,7 +175,7 @@ class Comparison:
 
     @property
     def rows_of_fit(self) -> str:
-        """That the error is no test, because the model was fitted to these rows; else empty."""
+        """Statement that the error is no test, as the model was fitted to these rows, or empty."""
         if not self.in_fit:
             return ""
         return f"no test of the model, which was fitted to {self.in_fit:.0%} of these rows"
@@ -309,7 +309,7 @@ class Compared:
 
     @property
     def summary(self) -> str:
-        """What model it is, in one line."""
+        """Description of the model in one line."""
         return self.table.model.summary()
 
     @property

@@ -59,7 +59,7 @@ class Search:
 
 @dataclass(frozen=True)
 class Worth:
-    """What a result is worth to its reader: 1 right, 0 "cannot tell".
+    """Utility of a result to its reader: 1 for a right name, 0 for "cannot tell".
 
     Stated, not fitted, but for the three costs that a fit chooses (`CHOSEN_COSTS`). A wrong name
     costs at least what a right one gains, so a name is given where it is more probably right than
@@ -95,7 +95,7 @@ class Worth:
 
 @dataclass(frozen=True)
 class Claim:
-    """What holds before "nothing is missing" is claimed, whatever the fitted probabilities are."""
+    """Conditions for the claim "nothing is missing", whatever the fitted probabilities are."""
 
     near_floor: float = 1.3
     """Most error over the noise floor that counts as near it: a tenth of a floor is how far apart

@@ -833,7 +833,7 @@ class Statement:
 
 @dataclass(frozen=True)
 class Decision:
-    """What the evidence amounts to."""
+    """Result that follows from the evidence."""
 
     kind: Kind
     """Kind of the result."""

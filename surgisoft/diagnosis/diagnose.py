@@ -344,7 +344,7 @@ def amend_command(result: Diagnosis, unknown: bool) -> str:
 def findings_of(
     problem: Problem, report: Progress, without: Collection[str]
 ) -> tuple[Findings, tuple[NotTestable, ...]]:
-    """What model selection finds on an identification problem, and which effects it cannot show."""
+    """Findings of model selection on an identification problem, and effects it cannot show."""
     report("sensitivities of the effects")
     names = known_effects()
     for name in without:
@@ -497,7 +497,7 @@ def result_of(found: Findings, decision: Decision | None = None) -> Diagnosis:
 
 
 def would_explain(found: Findings, decision: Decision) -> list[str]:
-    """What an effect would explain of an error that the fit had already."""
+    """Share that an effect would explain of an error that the fit had already."""
     if decision.kind not in ("nothing_missing", "surrogate_undertrained", "cannot_tell"):
         return []
     if not found.first or found.selection.whole_size >= 1.0:
@@ -545,7 +545,7 @@ def _instead(evidence: Evidence) -> tuple[str, ...]:
 
 
 def knock(evidence: Evidence) -> str:
-    """What an unknown effect may be, as the end of its sentence: a knock of the base, or nothing.
+    """End of the sentence on an unknown effect: that it may be a knock of the base, or empty.
 
     Said where a turn at one moment is better than the best effect by 5 %, one-sided.
     """
@@ -658,7 +658,7 @@ def _most_probable(decision: Decision) -> str:
 
 
 def next_command(decision: Decision) -> str:
-    """What to do after a result, with `{model}`, `{data}` and `{before}` for the files."""
+    """Command to run after a result, with `{model}`, `{data}` and `{before}` for the files."""
     kind, names = decision.kind, decision.effects
     if kind in ("identified", "several"):
         return (

@@ -263,7 +263,7 @@ LEAST_SHARE = 0.05
 
 @dataclass(frozen=True)
 class Profile:
-    """What one column of an axis explains, laid out over its values in bands of equal count."""
+    """Error that one column of an axis explains, by bands of equal count of its values."""
 
     column: str
     """The column: the axis, with the number of the chamber where it has one."""

@@ -31,7 +31,7 @@ SHORT_S = 0.25
 
 @dataclass(frozen=True, eq=False)
 class Memory:
-    """What goes along with each row of a history, (S, ...) rows of all runs one after another."""
+    """Features of the past of each row of a history, (S, ...) rows of all runs in order."""
 
     pressure: np.ndarray
     """(S, m) actuation, arm's unit."""

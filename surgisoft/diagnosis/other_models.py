@@ -211,7 +211,7 @@ def has_slope(model: ArmModel) -> bool:
 
 
 def notes_of(model: ArmModel) -> list[str]:
-    """What a reader has to know of a model of other origin; empty for a fitted one."""
+    """Limits of a diagnosis of a model of other origin; empty for a fitted one."""
     network = model.network
     notes: list[str] = []
     if not isinstance(network, CallableNetwork | PredictedNetwork):

@@ -361,7 +361,7 @@ def matches(
 def all_matches(
     after: list[RunSignal], before: list[RunSignal], alike: np.ndarray, itself: bool = False
 ) -> list[Match]:
-    """What the runs of AFTER repeat of the runs of BEFORE.
+    """Windows of the runs of AFTER that repeat motion of the runs of BEFORE.
 
     A run at rest fits at every delay: it is paired at the delays at which other runs of the same
     two recordings repeat each other. itself: both are the same runs, which are not their own
@@ -982,7 +982,7 @@ class BeforeAfter:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the reader of a result must know."""
+        """Limits of the result, in words."""
         if self.used:
             return ()
         share = float(self.pairs.paired[~self.table.held_out].mean())

@@ -75,7 +75,7 @@ REFIT = RefitConfig()
 
 @dataclass(frozen=True)
 class RefitCriteria:
-    """What starts a refit, and what decides in it.
+    """Thresholds that start a refit and decide in it.
 
     The values were set by hand on virtual robots, for residuals and before there was a refit; none
     was set by looking at one.
@@ -332,7 +332,7 @@ class Job:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What a training came to."""
+    """Result of one training."""
 
     model: ArmModel
     """The trained model."""

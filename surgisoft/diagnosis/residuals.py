@@ -239,7 +239,7 @@ class ResidualTable:
 
     @cached_property
     def memory(self) -> Memory:
-        """What the actuation's past amounts to in each row."""
+        """Features of the actuation's past in each row."""
         return memory_of(self.history, self.spec)
 
     def features_at(self, rows: np.ndarray) -> np.ndarray:
@@ -562,7 +562,7 @@ class Problem:
         )
 
     def with_model(self, model: ArmModel) -> "Problem":
-        """These rows under another model of the same arm."""
+        """The same rows with the residuals of another model of the arm."""
         with torch.no_grad():
             predicted = self.rows(model.predict(self.history)).double().numpy()
         return replace(self, model=model, predicted=predicted)

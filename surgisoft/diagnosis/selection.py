@@ -372,7 +372,7 @@ class RelaxedFit:
 
 
 def relaxed_fit(selection: ModelSelection, named: Sequence[Score]) -> RelaxedFit:
-    """What effects explain more in their relaxed form: the better of the two."""
+    """Additional gain of effects in their relaxed form: the better of two fits."""
     tried = []
     for scaled in (_by_state, _by_time):
         sensitivities = _relaxed_sensitivities(selection, named, scaled)
@@ -589,7 +589,7 @@ class Selected:
 
 @dataclass(frozen=True, eq=False)
 class Findings(Selected):
-    """What model selection found on a problem, and the tests of it."""
+    """Result of model selection on a problem, and its tests."""
 
     forms: dict[str, RelaxedFit]
     """Lack of fit of the best effect alone and of those that explain about as much."""

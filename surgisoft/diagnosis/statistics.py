@@ -155,7 +155,7 @@ def sign_flip_p_values(
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """What a regression predicts for rows of folds that it was not fitted to."""
+    """Predictions of a regression for rows of folds that it was not fitted to."""
 
     predicted: np.ndarray
     """(S, k) predictions; every row by the fit that left its fold out."""

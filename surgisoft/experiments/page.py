@@ -175,7 +175,7 @@ def markdown(results: Results) -> str:
 
 
 def rules(results: Results) -> str:
-    """What counts as a success, in one sentence; the rule of the task beneath, and no abort."""
+    """Definition of success in one sentence: the rule of the task, and no abort."""
     spec = results.experiment
     rule = spec.of.success_rule
     return f"Success: {f'{rule(spec.task)}; ' if rule else ''}nothing is aborted."

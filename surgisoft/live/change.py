@@ -154,7 +154,7 @@ LARGEST_SCALE = 10.0
 
 @dataclass(frozen=True)
 class AlarmDesign:
-    """What is to be detected, and how often a false alarm is accepted."""
+    """Change to be detected, and accepted rate of false alarms."""
 
     false_alarm_h: float = 10.0
     """Mean time between false alarms that the threshold is set for [h]. Ten times the hour that is

@@ -96,7 +96,7 @@ ClockName = Literal["real", "simulated"]
 
 @dataclass(frozen=True)
 class RunRequest:
-    """What drives a rig, for how long, and what watches it."""
+    """Request for a run: what drives the rig, for how long, and what watches it."""
 
     policy: str
     """`scripted`, `random`, a training run's folder, a schedule file (.csv) or a continuous

@@ -42,7 +42,7 @@ ROW_GROUPS, COLUMNS = (4, 9), (1, 9)
 
 
 def open_metadata(path: Path) -> pq.FileMetaData:
-    """What a Parquet file states of its content, once all its pages keep to the limits.
+    """Metadata of a Parquet file, after all its pages were found to keep to the limits.
 
     Raises InputError where the file is no Parquet file, where its pages do not lie in it, and where
     they claim more than `MOST_PACKED` bytes for each byte of it.

@@ -19,7 +19,7 @@ and starts its threads when it is imported."""
 
 @dataclass(frozen=True)
 class Contents:
-    """What a recording holds."""
+    """Contents of a Rerun recording."""
 
     duration_s: float | None
     """Duration on its timeline of seconds, s; None if it has no such timeline."""
@@ -60,6 +60,6 @@ def read(recording: Path) -> Contents:
 
 
 def as_bytes(recording: Path) -> bytes:
-    """What a recording holds, as JSON."""
+    """Contents of a Rerun recording as JSON."""
     found = read(recording)
     return json.dumps({"duration_s": found.duration_s, "views": found.views}).encode()

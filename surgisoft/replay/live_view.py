@@ -67,7 +67,7 @@ The alarm level begins when the reference of the change detector is complete.
 
 @dataclass(frozen=True)
 class LiveBench:
-    """What the view shows of a rig."""
+    """Properties of a rig that the view needs."""
 
     chambers: int
     """Number m of chambers."""

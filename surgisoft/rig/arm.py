@@ -27,7 +27,7 @@ STANDARD_GRAVITY = 9.80665
 
 @dataclass(frozen=True)
 class ArmDesign:
-    """What the mould and the recipe fix."""
+    """Design of an arm, which its mould and its material fix."""
 
     length_mm: float = 70.0
     """Length with both caps [mm] (Chen et al. 2025, sec. II)."""

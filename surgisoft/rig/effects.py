@@ -76,7 +76,7 @@ class Effects(NamedTuple):
 
 
 class History(NamedTuple):
-    """What the effects remember; updated in place."""
+    """Memory of the effects; updated in place."""
 
     creep: np.ndarray
     """(m, 5) retarded loads [-]."""

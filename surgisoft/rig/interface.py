@@ -17,7 +17,7 @@ from surgisoft.measurement.recordings import ArmInfo
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """What a rig measured at one instant."""
+    """Measurements of a rig at one instant."""
 
     t_s: float
     """Time since the rig was switched on [s]."""

@@ -58,7 +58,7 @@ class Cameras(NamedTuple):
 
 
 class Tracking(NamedTuple):
-    """What the cameras carry from frame to frame; updated in place."""
+    """State of the cameras from frame to frame; updated in place."""
 
     slow: np.ndarray
     """(n, k, 3) slow noise [mm]."""

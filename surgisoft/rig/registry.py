@@ -168,7 +168,7 @@ def _from_the_start(given: Iterable[str | HiddenEffect]) -> tuple[HiddenEffect, 
 
 @dataclass(frozen=True)
 class RigText:
-    """What a text `NAME[:option=value,...]` names."""
+    """Rig and options of a text `NAME[:option=value,...]`."""
 
     name: str
     """Name of a rig, or `package.module:object`."""

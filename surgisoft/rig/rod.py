@@ -53,7 +53,7 @@ class Rod(NamedTuple):
 
 
 class Loads(NamedTuple):
-    """What acts on the rod from outside."""
+    """External loads on the rod."""
 
     gravity: np.ndarray
     """(3,) unit vector of weight, arm base frame."""

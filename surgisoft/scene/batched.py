@@ -265,7 +265,7 @@ class BatchedScene:
         arms: Mapping[str, np.ndarray],
         own: str | None = None,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What rays (N, 3) meet first among bodies at rest, where that is beyond doubt.
+        """First hits of rays (N, 3) on bodies at rest, where they are certain.
 
         Returns a `Struck` (N,) int8, the ends (N, 3) mm in double precision, and sure (N,) bool.
         Where a ray is sure, no engine that is right to `BESIDE_MM` finds anything else: it meets a
@@ -362,7 +362,7 @@ class BatchedScene:
 
 @dataclass(frozen=True, eq=False)
 class LoneView:
-    """What one camera sees of M points, in kept arrays with a batch of one in front."""
+    """View of M points by one camera, in reused arrays with a batch of one in front."""
 
     wanted: np.ndarray
     """(1, M) bool: inside the cone and in range."""

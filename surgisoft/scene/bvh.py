@@ -374,7 +374,7 @@ class TriangleTree:
 
     @property
     def arrays(self) -> tuple[np.ndarray, ...]:
-        """What the compiled queries walk: triangles, starts, lower, upper."""
+        """Arrays that the compiled queries traverse: triangles, starts, lower, upper."""
         return self.triangles_mm, self.starts, self.lower, self.upper
 
     def nearest(

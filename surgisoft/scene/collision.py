@@ -371,7 +371,7 @@ class CollisionChecker:
         radii_mm: Mapping[str, float],
         own: str | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """What each of B rays meets first, a `Struck` (B,) int8, and where it ends (B, 3) mm.
+        """First hit of each of B rays: a `Struck` (B,) int8, and its end (B, 3) mm.
 
         As `cast`, each ray (B, 3) among arms of its own: name -> (B, K, 3) mm. Closed forms are
         evaluated for all rays at once; FCL finds the faces, of bodies whose box the ray enters

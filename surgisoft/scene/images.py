@@ -46,7 +46,7 @@ from surgisoft.scene.render import (
 
 
 class Label(IntEnum):
-    """What a pixel shows: the values of `rays.Struck`, and two kinds of the organ's tissue."""
+    """Class of a pixel: the values of `rays.Struck`, and two kinds of the organ's tissue."""
 
     NOTHING = int(Struck.NOTHING)
     ORGAN = int(Struck.ORGAN)

@@ -603,7 +603,7 @@ def _together(
     apart: dict[tuple, float | None] = {}
 
     def gain(one: tuple[str, int], other: tuple[str, int]) -> float | None:
-        """What a pair of mounts adds to the score; None where the two arms come too close."""
+        """Contribution of a pair of mounts to the score; None if the two arms come too close."""
         if (one, other) not in apart:
             first, second = sites[one[0]][one[1]], sites[other[0]][other[1]]
             apart[one, other] = _pair_score(

@@ -23,7 +23,7 @@ from surgisoft.scene.mesh import Body, Mesh
 
 
 class Struck(IntEnum):
-    """What a ray meets first."""
+    """Kind of body that a ray hits first."""
 
     NOTHING = 0
     ORGAN = 1

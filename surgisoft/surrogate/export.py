@@ -196,7 +196,7 @@ def differences(folder: str | Path) -> dict[str, dict[str, float]]:
 
 
 def describe_arm(graph: ArmGraph, worst_mm: float) -> dict[str, Any]:
-    """What `arm.json` says: names, shapes, units and ranges of all inputs and outputs.
+    """Contents of `arm.json`: names, shapes, units and ranges of all inputs and outputs.
 
     worst_mm: the largest difference from `ArmModel.predict` that was found, mm.
     """

@@ -119,7 +119,7 @@ class ErrorInterval:
         return asdict(self)
 
     def sentence(self) -> str:
-        """What it says on a row like those of the training, in one line."""
+        """The interval on a row like those of the training, in one line."""
         radii = " ".join(f"{value:.2f}" for value in self._quantile(LEVEL))
         beyond = f"; wider by {self.growth:g} x distance to the training data" * (self.growth > 0)
         few = f"; fewer than {EXACT_GROUPS}, so it assumes log-normal sizes of their errors"

@@ -118,7 +118,7 @@ class AreaAblationConfig(LaserConfig):
 
 
 def success_rule(config: AreaAblationConfig) -> str:
-    """What an episode needs to be a success, in words; `measures` computes it."""
+    """Definition of success, in words; `measures` computes it."""
     return (
         f"{100.0 * config.treated_share:g} % of the lesions' area has {config.dose_j_per_mm2:g} "
         f"J/mm2 or more, at most {config.healthy_mm2:g} mm2 of healthy tissue more than "

@@ -81,7 +81,7 @@ class BreathingAblationConfig(LaserConfig):
 
 
 def success_rule(config: BreathingAblationConfig) -> str:
-    """What an episode needs to be a success, in words; `measures` computes it."""
+    """Definition of success, in words; `measures` computes it."""
     gate = ""
     if config.mode == "gated":
         gate = f" and while the organ is within {config.gate_mm:g} mm of the end of exhalation"

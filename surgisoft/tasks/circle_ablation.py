@@ -42,7 +42,7 @@ class CircleAblationConfig(LaserConfig):
 
 
 def success_rule(config: CircleAblationConfig) -> str:
-    """What an episode needs to be a success, in words; `measures` computes it."""
+    """Definition of success, in words; `measures` computes it."""
     return (
         f"the whole ring is cut, without contact; the beam is on only within {config.fire_mm:g} mm "
         f"of its target (fire_mm), which goes once around in {config.cut_s:g} s (cut_s)"

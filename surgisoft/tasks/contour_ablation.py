@@ -68,7 +68,7 @@ class ContourAblationConfig(LaserConfig):
 
 
 def success_rule(config: ContourAblationConfig) -> str:
-    """What an episode needs to be a success, in words; `measures` computes it."""
+    """Definition of success, in words; `measures` computes it."""
     return (
         "every contour is cut along its whole length, without contact; the beam is on only within "
         f"{config.fire_mm:g} mm of its target (fire_mm), which moves at {config.speed_mm_s:g} mm/s "

@@ -73,7 +73,7 @@ class RewardTerm:
 
 @dataclass(frozen=True)
 class AgentDescription:
-    """What one agent observes, does and is rewarded for."""
+    """Observations, actions and rewards of one agent."""
 
     observation: tuple[ObservedBlock, ...]
     """Blocks in order."""
@@ -149,7 +149,7 @@ def describe(name: str, config: Any = None) -> TaskDescription:
 
 
 def describe_agents(task: DocumentedTask) -> dict[str, AgentDescription]:
-    """What each agent of a task observes, does and is rewarded for, by name."""
+    """Observations, actions and rewards of each agent of a task, by name."""
     blocks = task.blocks(Episodes(task).seeded(0, 1))
     return {agent: _agent(task, agent, blocks[agent]) for agent in task.agents}
 

@@ -142,7 +142,7 @@ class KeyholeAblationConfig(LaserConfig):
 
 
 def success_rule(config: KeyholeAblationConfig) -> str:
-    """What an episode needs to be a success, in words; `measures` computes it."""
+    """Definition of success, in words; `measures` computes it."""
     return (
         f"the whole ring is cut, without contact, with at most {config.rim_s:g} s (rim_s) nearer "
         f"than {config.rim_mm:g} mm (rim_mm) to the wall; the beam is on only within "

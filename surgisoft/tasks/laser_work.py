@@ -137,7 +137,7 @@ class LaserWorkWeights:
 
 @dataclass(frozen=True)
 class LaserConfig:
-    """What the configurations of these tasks share; each adds its own fields and `weights`."""
+    """Fields that the configurations of these tasks share; each adds its own and `weights`."""
 
     scene: str | Path = PHANTOM
     """Folder of the scene."""
@@ -171,7 +171,7 @@ def check_config(name: str, config: Any, *positive: str) -> None:
 
 
 class BeamProgress(TensorDataclass, Protocol):
-    """What the goal of such a task has to have."""
+    """Interface of the goal of such a task."""
 
     @property
     def fired(self) -> Tensor:
@@ -214,7 +214,7 @@ RELEASED = Signal(
 
 
 def view(state: TaskState) -> View:
-    """What the endoscope sees."""
+    """View of the endoscope."""
     return state.world.scene.view
 
 

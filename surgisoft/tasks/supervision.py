@@ -146,7 +146,7 @@ def _unsuccessful(row: Row) -> tuple:
 
 @dataclass(frozen=True)
 class ExperimentTask:
-    """What experiments need to know of a task before it is built."""
+    """Properties of a task that experiments need before it is built."""
 
     conditions: Mapping[str, Condition] = field(
         default_factory=lambda: {"succeeded": SUCCEEDED, "at rest": AT_REST, "never": NEVER}

@@ -154,7 +154,7 @@ class TwoLaserRingConfig(LaserConfig):
 
 
 def success_rule(config: TwoLaserRingConfig) -> str:
-    """What an episode needs to be a success, in words; `measures` computes it."""
+    """Definition of success, in words; `measures` computes it."""
     return (
         "the whole ring is cut by both beams together, without contact; a beam is on only within "
         f"{config.fire_mm:g} mm of its target (fire_mm), in view, and {config.beam_mm:g} mm clear "

@@ -52,7 +52,7 @@ ROOM = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """What an effect's signal must stand out from."""
+    """Noise and model discrepancy from which an effect's signal must stand out."""
 
     noise_mm: np.ndarray
     """(n,) RMS noise of each key point's distance, mm."""
@@ -241,7 +241,7 @@ class Design:
 
     @cached_property
     def signals(self) -> Signals:
-        """What the stages of the model see along the history."""
+        """Signals at the stages of the model along the history."""
         return signals(self)
 
 
@@ -419,7 +419,7 @@ SURE = 0.95
 
 @dataclass(frozen=True, eq=False)
 class Isolability:
-    """What a schedule can say about E effects, each at a plausible amplitude."""
+    """Isolability of E effects, each at a plausible amplitude, by one schedule."""
 
     names: tuple[str, ...]
     """The effects."""
@@ -453,7 +453,7 @@ def isolability(
     rows: int = ROWS,
     size_mm: float | None = None,
 ) -> Isolability:
-    """What a schedule of actuations can say about the named effects (default: all known ones).
+    """Isolability of the named effects (default: all known ones) by a schedule of actuations.
 
     Of recordings only the actuation and the noise are looked at. size_mm: RMS change of a key
     point by an effect on the reference schedule (default: PLAUSIBLE_SHARE of the arm's length).
@@ -622,7 +622,7 @@ def moments_of(
 def uncertainty_of(
     model: ArmModel, noise_mm: np.ndarray | None, signal_mm: np.ndarray, dt_s: float
 ) -> Uncertainty:
-    """What effects of size signal_mm (n,) must stand out from on a model; noise_mm (n,) RMS."""
+    """Uncertainty from which effects of size signal_mm (n,) must stand out; noise_mm (n,) RMS."""
     points, length = model.spec.key_points, length_of(model)
     if noise_mm is None:
         noise_mm = np.full(points, CAMERA_SHARE * length)

@@ -118,7 +118,7 @@ class Question:
     prediction."""
 
     def isolability(self, moments: Moments) -> Isolability:
-        """What moments of sensitivities and own weight say about the competing effects."""
+        """Isolability of the competing effects from moments of sensitivities and own weight."""
         return isolability_from(moments, self.draws, self.owners, self.spans, self.misfit)
 
 
@@ -533,7 +533,7 @@ def _score(result: Isolability) -> float:
 
 @dataclass(frozen=True)
 class Experiment:
-    """What to record next."""
+    """The recommended experiment in short."""
 
     name: str
     """Its name."""
@@ -561,7 +561,7 @@ class Pair:
 
 @dataclass(frozen=True, eq=False)
 class Recommendation:
-    """What to do on the bench next, and what it is worth."""
+    """The recommended experiment, and how well it distinguishes the competing effects."""
 
     name: str
     """Its name: the excitation signals and the experimental setup."""

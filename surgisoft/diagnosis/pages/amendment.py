@@ -284,7 +284,7 @@ MOST_WORDS = 6
 
 
 def effect_words(name: str) -> str:
-    """What an effect is, in one sentence: the first of its docstring."""
+    """Description of an effect in one sentence: the first of its docstring."""
     found = known_effects().get(name)
     return (inspect.getdoc(found) or "").split("\n")[0] if found is not None else ""
 

@@ -217,7 +217,7 @@ def axis_charts(result: Comparison, unit: str) -> list[Picture]:
 
 
 def share_chart(share: AxisShare, floor_mm: float | None) -> Picture:
-    """What an axis explains: the error without and with it above, the tip's residual below.
+    """Chart of an axis: above, the error without and with it; below, the tip's residual.
 
     The upper panel is over the column that explains most. Draw inside `drawing`.
     """

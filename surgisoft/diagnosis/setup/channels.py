@@ -18,7 +18,7 @@ STILL = 0.003
 
 @dataclass(frozen=True)
 class Dead:
-    """What one recording, or several of one set-up, hold constant."""
+    """Channels that are constant in one recording, or in several of one set-up."""
 
     key_points: dict[int, float]
     """Recorded key point, from 0 -> share of the rows in which it is frozen."""

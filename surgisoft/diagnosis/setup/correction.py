@@ -22,7 +22,7 @@ ROUNDED = 6
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """What turns recordings of a faulty set-up into those of a right one."""
+    """Correction of recordings of a faulty set-up."""
 
     arrangement: Arrangement
     """Which recorded channel drives each chamber, in which unit."""

@@ -49,7 +49,7 @@ MOST_APART = 8
 
 @dataclass(frozen=True)
 class SetupResult:
-    """What is wrong with the set-up of some recordings."""
+    """Faults in the set-up of some recordings."""
 
     faults: tuple[SetupFault, ...]
     """The faults; all of them hold together."""

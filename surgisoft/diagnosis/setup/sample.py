@@ -110,7 +110,7 @@ class Sample:
         return self.predicted_single(arrangements).astype(float)
 
     def predicted_single(self, arrangements: Sequence[Arrangement]) -> np.ndarray:
-        """What `predicted` gives in single precision, in which models compute."""
+        """Result of `predicted` in single precision, in which models compute."""
         wide = self._arranged(arrangements)
         with torch.no_grad():
             points = wide.rows(self.model.predict(wide)).numpy()

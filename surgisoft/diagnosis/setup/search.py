@@ -70,7 +70,7 @@ class SearchSettings:
 
 @dataclass(frozen=True)
 class Proof:
-    """What a correction must show before it is called a fault of the set-up.
+    """Evidence that a correction must show before it is called a fault of the set-up.
 
     Most numbers were set by reasoning on what they stand for. The test of a lag, the share of
     blocks and the rule for key points were changed after failures on robots of development; the
@@ -231,7 +231,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Levels:
-    """What errors are compared with, RMS distances of a key point, mm."""
+    """Levels that errors are compared with, RMS distances of a key point, mm."""
 
     noise: float
     """Noise of the measurement."""

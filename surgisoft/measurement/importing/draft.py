@@ -72,7 +72,7 @@ class _Layout:
     """All groups or structs that hold the same columns as that one."""
 
     def label(self, name: str) -> str:
-        """What says what a column is: its name, or of a path the name of the array."""
+        """Part of a column's name that describes it: of a path, the name of the array."""
         return A_PLACE.sub("", name).rpartition(".")[2] if self.paths else name
 
 

@@ -19,7 +19,7 @@ BASE_MOTION = 3.0
 
 
 def plausibility_notes(recording: Recording, unit: str | None) -> list[str]:
-    """What contradicts the arm's stated length or the order base to tip; unit: of the positions."""
+    """Contradictions to the arm's stated length or the order base to tip; unit: of positions."""
     return [*_length(recording, unit), *_order(recording)]
 
 

@@ -39,7 +39,7 @@ class Draft:
     """(T,) number of the steady-state point that a row belongs to; -1: none."""
 
     def take(self, rows: np.ndarray) -> "Draft":
-        """These samples (indices or a mask)."""
+        """The samples with these indices, or where a mask is true."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         return replace(self, **{k: v[rows] for k, v in values.items() if v is not None})
 

@@ -42,7 +42,7 @@ waits then. At 50 Hz this is more than three minutes."""
 
 @dataclass(frozen=True)
 class LogHeader:
-    """What the first line of a log states."""
+    """Contents of the first line of a log."""
 
     name: str
     """Name of the recording."""

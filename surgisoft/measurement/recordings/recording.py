@@ -122,7 +122,7 @@ class Recording:
 
     @property
     def label(self) -> str:
-        """What an error message calls it: the file where there is one."""
+        """Name of the recording in error messages: the file, where there is one."""
         return str(self.source) if self.source else f"recording '{self.name}'"
 
 

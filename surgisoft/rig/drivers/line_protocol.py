@@ -74,7 +74,7 @@ def words_of(raw: bytes, side: str) -> list[str] | None:
 
 @dataclass(frozen=True)
 class Info:
-    """What a controller states about itself."""
+    """Properties that a controller states about itself."""
 
     chambers: int
     """Number m of chambers."""

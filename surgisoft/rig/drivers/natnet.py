@@ -93,7 +93,7 @@ class Cursor:
 
 @dataclass(frozen=True)
 class Server:
-    """What a server states about itself."""
+    """Properties that a server states about itself."""
 
     name: str
     """Name of the program, such as Motive."""

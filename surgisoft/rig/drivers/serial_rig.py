@@ -173,7 +173,7 @@ class SerialRig:
 
     @property
     def counts(self) -> dict[str, int]:
-        """What went wrong on the way so far: name -> number."""
+        """Counts of communication errors so far: name -> number."""
         return {
             "damaged lines": self._controller.damaged,
             "damaged datagrams": self._frames.damaged,

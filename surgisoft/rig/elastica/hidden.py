@@ -26,7 +26,7 @@ STREAM = 0xE1A
 
 @dataclass
 class Setup:
-    """What a hidden effect may change."""
+    """Parameters that a hidden effect may change."""
 
     plant: Plant
     """Parameters of the rig."""

@@ -55,7 +55,7 @@ class Wall(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What a wall with K places and d components of strain remembers; updated in place."""
+    """Memory of a wall with K places and d components of strain; updated in place."""
 
     last: np.ndarray
     """(d, K) strain x."""

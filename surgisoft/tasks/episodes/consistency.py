@@ -125,7 +125,7 @@ class _Sizes:
 
 
 def contradiction(log: EpisodeLog) -> str | None:
-    """What is wrong with a log, in words; None where its parts fit each other."""
+    """Contradiction within a log, in words; None if its parts fit each other."""
     time = log.time_s
     if not isinstance(time, np.ndarray) or time.ndim != 1 or not len(time):
         return "it has no rows"

@@ -129,7 +129,7 @@ class AdaptationPrior:
 
 @dataclass(frozen=True, eq=False)
 class Adaptation:
-    """What was learned of B arms; D = 3 n coordinates, F model errors, L lags, k = F + L + D.
+    """Estimates for B arms; D = 3 n coordinates, F model errors, L lags, k = F + L + D.
 
     The state is in units of its prior standard deviations, which keeps float32 exact enough.
     """
@@ -147,7 +147,7 @@ class Adaptation:
 
 
 class Estimate(NamedTuple):
-    """What follows from a measurement of B arms."""
+    """Estimates that follow from a measurement of B arms."""
 
     memory: Adaptation
     """What is known then, as of the next step: transients have decayed, and all may have
@@ -231,7 +231,7 @@ class DisturbanceEstimator:
         samples: int = 1,
         settled: bool = False,
     ) -> Estimate:
-        """What is known after a measurement.
+        """Estimates after a measurement.
 
         off_mm: (B, n, 3) mm, base frame: measured key points less the model's, nan where one was
         lost; the expected disturbance stands in for it. pressure: (B, m) kPa. points_mm:

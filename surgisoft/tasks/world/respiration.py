@@ -94,7 +94,7 @@ class Breaths:
     """(B,) s since the episode began."""
 
     def after(self, dt_s: float) -> Breaths:
-        """These breaths dt_s seconds later."""
+        """The breathing states after dt_s seconds."""
         return replace(self, time_s=self.time_s + dt_s)
 
     def displacement_mm(self, asymmetry: int, ahead_s: float = 0.0) -> tuple[Tensor, Tensor]:

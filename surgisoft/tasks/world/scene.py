@@ -80,7 +80,7 @@ class SceneState:
 
     @property
     def view(self) -> View:
-        """What the scene's only endoscope sees of the ring, (B,)."""
+        """View of the ring by the scene's only endoscope, (B,)."""
         return only(self.views, "endoscope")
 
 

@@ -97,12 +97,12 @@ def floor(robot: int, poses: int = Randomisation.history) -> Floor:
     raw = torch.nan_to_num(off[first:, 0])
     return Floor(
         raw_mm=_beam_mm(arm, true, goal, raw[after:]),
-        filter_mm=_beam_mm(arm, true, goal, _filtered(gains, raw)[after:]),
+        filter_mm=_beam_mm(arm, true, goal, filtered(gains, raw)[after:]),
         learns_mm=_beam_mm(arm, true, goal, torch.stack(learned)[first + after :]),
     )
 
 
-def _filtered(gains: ObserverGains, off: Tensor) -> Tensor:
+def filtered(gains: ObserverGains, off: Tensor) -> Tensor:
     """(T, n, 3) mm: the disturbance that the alpha-beta filter estimates from measured ones."""
     alpha_beta = AlphaBetaFilter(gains.observer_gain, gains.drift_gain)
     offset, drift, found = off[0], torch.zeros_like(off[0]), []

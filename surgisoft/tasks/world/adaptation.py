@@ -42,6 +42,7 @@ from surgisoft.errors import InputError
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.reach import steady_key_points
 from surgisoft.tasks.world.arm_errors import ArmErrors, ErrorPrior, jacobians
+from surgisoft.tasks.world.compiled_adaptation import learn
 
 USUAL = 0.1
 """Distance of the body, as a share of its range, at which the time constant of a lag is stated."""
@@ -174,6 +175,8 @@ class DisturbanceEstimator:
         """model: the arm; dt_s: time between two updates, s. Pressures, and `prior.chambers_kPa`,
         are in the unit of the model, which is kPa unless it says otherwise."""
         self.prior = prior = prior or AdaptationPrior()
+        self.compiles = True
+        """Whether compiled loops are taken where they can be; else the tensor operations."""
         self.errors = ArmErrors(model, prior.errors, device)
         spec = model.spec
         low, high = (np.array(each) for each in (spec.low, spec.high))
@@ -201,8 +204,7 @@ class DisturbanceEstimator:
         """Shapes (D, D) of transients, in columns: orthogonal, the likeliest one last."""
         self.transient = tensor(shapes * np.sqrt(variance))
         """(D, D) mm: what transients of one standard deviation add to each coordinate."""
-        self.kept, self.growth = self.keep[:, None] * self.keep, torch.diag(tensor(grows))
-        self.stirs = torch.diag(tensor(stirs))
+        self.growth, self.stirs = tensor(grows), tensor(stirs)
         self.dt_s, self.known, self.late = dt_s, slice(0, some), slice(some, some + lags)
         self.passing = slice(some, None)
         self.moving = self.shapes[:, -(spec.chambers + 3) :]
@@ -246,23 +248,13 @@ class DisturbanceEstimator:
         measured = off_mm.flatten(1)
         surprise = measured - _times(inputs, memory.mean)
         surprise = torch.where(measured.isfinite(), surprise, torch.zeros_like(surprise))
-        noise = self.prior.noise_mm**2 / samples
-        across = memory.covariance @ inputs.mT
-        eye = torch.eye(body.shape[1], device=body.device)
-        power = inputs @ across + noise * eye
-        unrest = self._unrest(memory.unrest, surprise, power)
-        gain = across @ _inverse(power)
-        mean = memory.mean + _times(gain, surprise)
-        covariance = memory.covariance - gain @ across.mT
-        # Joseph's form: 0 but for the rounding, which large motions would let grow.
-        covariance = covariance + (noise * gain - covariance @ inputs.mT) @ gain.mT
-        covariance = 0.5 * (covariance + covariance.mT)
+        fast = self.compiles and _plain(inputs, memory.covariance)
+        absorb = self._absorbed if fast else self._absorbed_reference
+        change, covariance, unrest = absorb(memory, inputs, surprise, samples)
+        mean = memory.mean + change
         passing = _times(inputs[..., self.passing], mean[:, self.passing])
         shown = memory.shown_mm + self._adopts(mean) * (passing - memory.shown_mm)
-        grown = self.growth + unrest[:, None, None] * self.stirs
-        after = Adaptation(
-            mean * self.keep, covariance * self.kept + grown, gap + body[:, None], unrest, shown
-        )
+        after = Adaptation(mean * self.keep, covariance, gap + body[:, None], unrest, shown)
         now, lead = _times(inputs, mean), shown - passing
         decays = 1.0 - self.keep[-1]
         ends = _times(inputs[..., self.late.stop :], decays * mean[:, self.late.stop :])
@@ -275,6 +267,46 @@ class DisturbanceEstimator:
         mean: (B, k), as that of `Adaptation`.
         """
         return self.prior.late_share * mean[:, self.late].sum(1)
+
+    def _absorbed_reference(
+        self, memory: Adaptation, inputs: Tensor, surprise: Tensor, samples: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Change of the mean (B, k), covariance (B, k, k) as of the next step, and `unrest` (B,).
+
+        inputs: (B, D, k) mm; surprise: (B, D) mm, the innovation; samples: see `updated`. With the
+        Cholesky factor of the innovation's covariance, S = L L', the covariance becomes
+        P - W W', W = P H' L^-T.
+        """
+        size = inputs.shape[1]
+        across = inputs @ memory.covariance
+        noise = self.prior.noise_mm**2 / samples
+        power = across @ inputs.mT + noise * torch.eye(size, device=inputs.device)
+        unrest = self._unrest(memory.unrest, surprise, power)
+        white = _whitened(power, torch.cat((surprise[..., None], across), 2))
+        change = _times(white[..., 1:].mT, white[..., 0])
+        covariance = memory.covariance - white[..., 1:].mT @ white[..., 1:]
+        covariance = 0.5 * (covariance + covariance.mT)
+        grown = torch.diag(self.growth) + unrest[:, None, None] * torch.diag(self.stirs)
+        return change, covariance * (self.keep[:, None] * self.keep) + grown, unrest
+
+    def _absorbed(
+        self, memory: Adaptation, inputs: Tensor, surprise: Tensor, samples: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The same as `_absorbed_reference`, compiled."""
+        change, after = torch.empty_like(memory.mean), torch.empty_like(memory.covariance)
+        unrest, prior = torch.empty_like(memory.unrest), self.prior
+        rate = self.dt_s / prior.unrest_s
+        rules = (rate, prior.innovation, prior.startling, prior.quietest, prior.liveliest)
+        given = (inputs, memory.covariance, surprise, memory.unrest)
+        learn(
+            *(each.contiguous().numpy() for each in given),
+            np.float32(prior.noise_mm**2 / samples),
+            self.moving.mT.contiguous().numpy(),
+            np.array(rules, np.float32),
+            *(each.numpy() for each in (self.keep, self.growth, self.stirs)),
+            *(each.numpy() for each in (change, after, unrest)),
+        )
+        return change, after, unrest
 
     def _unrest(self, unrest: Tensor, surprise: Tensor, power: Tensor) -> Tensor:
         """(B,): variance of transients after innovations (B, D) mm of covariance `power`.
@@ -313,17 +345,27 @@ def _times(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix @ vector[..., None])[..., 0]
 
 
-def _inverse(matrix: Tensor) -> Tensor:
-    """Inverse of symmetric positive definite matrices (B, D, D), by Gauss-Jordan elimination.
+def _whitened(power: Tensor, across: Tensor) -> Tensor:
+    """(B, D, c): L^-1 across, with L the Cholesky factor of power (B, D, D); across: (B, D, c).
 
-    Such matrices need no pivoting (Higham 2002, sec. 14.4). ONNX has no inverse.
+    By elimination: ONNX has neither a factorization nor a solver.
     """
-    scale = matrix.diagonal(dim1=1, dim2=2).sum(1)[:, None, None]
-    matrix, unit = matrix / scale, torch.eye(matrix.shape[1], device=matrix.device)
-    for i, one in enumerate(unit):
-        column, row = matrix[:, :, i] - one, (matrix[:, i] + one) / matrix[:, i, i, None]
-        matrix = matrix - column[:, :, None] * row[:, None]
-    return matrix / scale
+    left, rows = torch.cat((power, across), 2), []
+    for i in range(power.shape[1]):
+        row = left[:, 0] / left[:, 0, i, None].sqrt()
+        left = left[:, 1:] - row[:, i + 1 : power.shape[1], None] * row[:, None]
+        rows.append(row)
+    return torch.stack(rows, 1)[..., power.shape[2] :]
+
+
+def _plain(*tensors: Tensor) -> bool:
+    """Whether the compiled loops may take these tensors, which have no gradient and no tracer."""
+    if torch.compiler.is_compiling() or torch.jit.is_tracing():
+        return False
+    if any(type(tensor) is not Tensor or tensor.dtype != torch.float32 for tensor in tensors):
+        return False
+    graded = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+    return not graded and all(tensor.device.type == "cpu" for tensor in tensors)
 
 
 def _covariances(model: ArmModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

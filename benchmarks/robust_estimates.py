@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,7 @@ from surgisoft.tasks.world.adaptation import (
     Estimate,
 )
 from surgisoft.tasks.world.arm import Randomisation
+from surgisoft.tasks.world.arm_errors import ErrorPrior
 
 
 @dataclass(frozen=True)
@@ -104,40 +105,69 @@ def recorded(policy: str, robots: list[int], hidden: str, seed: int) -> tuple[Ta
     ]
 
 
-Observe = Callable[[Measured], Tensor]
-"""(T, n, 3) mm, base frame: the disturbance that an observer estimates from measurements."""
+Observe = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""Disturbances (T, R, n, 3) mm, base frame, that an observer estimates for R robots from `off_mm`
+(T, R, n, 3), `pressure` (T, R, m) and `body_mm` (T, R, n, 3)."""
 
 
 def learning(task: Task, prior: AdaptationPrior) -> Observe:
     """The observer that learns, with a prior."""
-    arm = task.world.arms[LASER]
-    estimator = DisturbanceEstimator(arm.model, task.dt_s, prior)
+    estimator = DisturbanceEstimator(task.world.arms[LASER].model, task.dt_s, prior)
 
-    def observe(measured: Measured) -> Tensor:
-        memory, found = estimator.start(1), []
-        for row in zip(measured.off_mm, measured.pressure, measured.body_mm, strict=True):
-            estimate = estimator.updated(memory, *(each[None] for each in row))
-            memory = estimate.memory
-            found.append(estimate.now_mm[0])
+    def observe(off: Tensor, pressure: Tensor, body: Tensor) -> Tensor:
+        memory, found = estimator.start(off.shape[1]), []
+        for row in zip(off, pressure, body, strict=True):
+            memory, now, _, _ = estimator.updated(memory, *row)
+            found.append(now)
         return torch.stack(found)
 
     return observe
 
 
-def filtering(measured: Measured) -> Tensor:
+def unfiltered(off: Tensor, pressure: Tensor, body: Tensor) -> Tensor:
+    """Single pictures; the model stands in where a key point was lost."""
+    return torch.nan_to_num(off)
+
+
+def filtering(off: Tensor, pressure: Tensor, body: Tensor) -> Tensor:
     """The alpha-beta filter with the gains of rigs."""
-    return filtered(ObserverGains(), torch.nan_to_num(measured.off_mm))
+    return filtered(ObserverGains(), unfiltered(off, pressure, body))
+
+
+def observers(task: Task) -> dict[str, Observe]:
+    """Observers by their name in the table: two without learning, today's, and today's in parts."""
+    today, none = AdaptationPrior(), 1e-9
+    errors = ErrorPrior(**{field.name: none for field in fields(ErrorPrior)})
+    still = {"chambers_kPa": none, "shift_mm": none, "turn_rad": none, "rest_mm": none}
+    priors = {
+        "that learns": today,
+        "that learns, without model errors": replace(today, errors=errors),
+        "that learns, without late motion": replace(today, late_share=none),
+        "that learns, without transients": replace(today, **still),
+        "that learns, variance of transients fixed": replace(today, quietest=1.0, liveliest=1.0),
+    }
+    learn = {name: learning(task, prior) for name, prior in priors.items()}
+    return {"single pictures": unfiltered, "alpha-beta filter": filtering, **learn}
 
 
 @torch.inference_mode()
 def errors_mm(task: Task, every: list[Measured], observe: Observe) -> list[float]:
     """Of each robot: mean distance of the estimated from the true beam at its target, mm."""
-    point, found = task.pointing[LASER], []
-    for measured in every:
-        size, turn = len(measured.true_mm), measured.pose[:3, :3]
-        seen = (measured.body_mm + observe(measured))[-size:] @ turn.mT + measured.pose[:3, 3]
-        bodies = (seen, measured.true_mm)
-        off, true = (point.offset_mm(body, measured.target_mm) for body in bodies)
+    longest, point, found = max(len(each.off_mm) for each in every), task.pointing[LASER], []
+
+    def side_by_side(name: str) -> Tensor:
+        rows = [getattr(each, name) for each in every]
+        return torch.stack(
+            [torch.cat((r, r[-1:].expand(longest - len(r), *r[0].shape))) for r in rows], 1
+        )
+
+    now = observe(*(side_by_side(name) for name in ("off_mm", "pressure", "body_mm")))
+    for robot, each in enumerate(every):
+        last, size = len(each.off_mm), len(each.true_mm)
+        seen = (each.body_mm + now[:last, robot])[last - size :]
+        seen = seen @ each.pose[:3, :3].mT + each.pose[:3, 3]
+        bodies = (seen, each.true_mm)
+        off, true = (point.offset_mm(body, each.target_mm) for body in bodies)
         found.append(float((off - true).norm(dim=1).mean()))
     return found
 
@@ -147,26 +177,20 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("--policy", default="scripted", help="policy of the closed loops")
     options.add_argument("--robots", default=",".join(map(str, DEVELOPMENT)), help="seeds")
-    options.add_argument("--hidden", default="", help="hidden effects, one table column each")
+    options.add_argument("--hidden", default="", help="hidden effects, a column each; empty: none")
     options.add_argument("--seed", type=int, default=2000, help="seed of the episodes")
     given = options.parse_args()
     robots = [int(robot) for robot in given.robots.split(",")]
-    columns = {}
+    columns: dict[str, dict[str, float]] = {}
     for hidden in given.hidden.split(","):
         task, every = recorded(given.policy, robots, hidden, given.seed)
-        today = AdaptationPrior()
-        observers: dict[str, Observe] = {
-            "alpha-beta filter": filtering,
-            "today's": learning(task, today),
-            "all parameters": learning(task, replace(today, least_mm=1e-9)),
-        }
-        columns[hidden or "none"] = {
+        columns[f"`{hidden}`" if hidden else "no effect"] = {
             name: float(np.mean(errors_mm(task, every, observe)))
-            for name, observe in observers.items()
+            for name, observe in observers(task).items()
         }
     print("| observer | " + " | ".join(columns) + " |")
     print("|---" * (len(columns) + 1) + "|")
-    for name in observers:
+    for name in observers(task):
         print(f"| {name} | " + " | ".join(f"{c[name]:.3f}" for c in columns.values()) + " |")
 
 

@@ -44,13 +44,13 @@ SHORT = {
 }
 """Fields that make an episode of a task short, but not below 25 steps, and its feed begin in it."""
 AGREE_MM = 1e-4
-"""Tolerance of an estimated key point."""
-ROUNDING_MM = {"keyhole_ablation": 1e-3, "two_laser_ring": 1e-3}
-"""The same where rounding is amplified: carriages feed the arms in, whose places are sums that
-round otherwise, by 1e-5 mm; with three arms the first updates of the observer's covariance, in
-single precision, leave 6e-4 mm."""
-STRANGE = RigConfig(seed=1, settle_s=0.3)
-"""Another robot than the one that the model was fitted to."""
+"""Tolerance of a true key point."""
+AGREE_KPA = 1e-4
+"""Tolerance of a command."""
+STRANGE = RigConfig(seed=1, settle_s=0.3, noise=0.0)
+"""Another robot than the one that the model was fitted to. Without noise its pressure sensors read
+without steps. With steps of 0.02 kPa a command that differs by 1e-6 kPa can change a reading of the
+pumps' controllers, and moves the body by up to 7e-4 mm until the next reading (`laser_plane`)."""
 
 
 @pytest.fixture(scope="module")
@@ -114,8 +114,8 @@ def test_the_exported_controller_does_on_the_rig_what_evaluate_does(engine, poli
     """To 1e-4 mm, on a robot that the model does not know, from measurements alone."""
     found = check_on_rig(Controller(exported, engine), policy.run.task(), policy, STRANGE, seed=4)
     assert found.decisions == 25
-    assert found.points_mm < 1e-4
-    assert found.commands_kPa < 1e-3
+    assert found.points_mm < AGREE_MM
+    assert found.commands_kPa < AGREE_KPA
 
 
 @pytest.mark.parametrize("name", SHORT)
@@ -130,8 +130,8 @@ def test_the_controller_of_every_task_does_on_the_rig_what_evaluate_does(name):
     controller = running(ControllerGraph(task, actors))
     found = check_on_rig(controller, task, ActorPolicy(actors), STRANGE, seed=3)
     assert found.decisions == 25
-    assert found.points_mm < ROUNDING_MM.get(name, AGREE_MM)
-    assert found.commands_kPa < 1e-3
+    assert found.points_mm < AGREE_MM
+    assert found.commands_kPa < AGREE_KPA
 
 
 def test_every_task_has_a_controller():

@@ -132,7 +132,8 @@ class AdaptationPrior:
 class Adaptation:
     """Estimates for B arms; D = 3 n coordinates, F model errors, L lags, k = F + L + D.
 
-    The state is in units of its prior standard deviations, which keeps float32 exact enough.
+    The state is in units of its prior standard deviations, so that float32 is exact enough to keep
+    it in.
     """
 
     mean: Tensor
@@ -275,19 +276,21 @@ class DisturbanceEstimator:
 
         inputs: (B, D, k) mm; surprise: (B, D) mm, the innovation; samples: see `updated`. With the
         Cholesky factor of the innovation's covariance, S = L L', the covariance becomes
-        P - W W', W = P H' L^-T.
+        P - W W', W = P H' L^-T. In float64: the condition number of S is 1,000 and more, and the
+        gain would amplify the rounding of float32 as much.
         """
-        size = inputs.shape[1]
-        across = inputs @ memory.covariance
+        before, inputs, surprise = (each.double() for each in (memory.covariance, inputs, surprise))
+        across = inputs @ before
         noise = self.prior.noise_mm**2 / samples
-        power = across @ inputs.mT + noise * torch.eye(size, device=inputs.device)
+        eye = torch.eye(inputs.shape[1], dtype=torch.float64, device=inputs.device)
+        power = across @ inputs.mT + noise * eye
         unrest = self._unrest(memory.unrest, surprise, power)
         white = _whitened(power, torch.cat((surprise[..., None], across), 2))
         change = _times(white[..., 1:].mT, white[..., 0])
-        covariance = memory.covariance - white[..., 1:].mT @ white[..., 1:]
-        covariance = 0.5 * (covariance + covariance.mT)
+        after = before - white[..., 1:].mT @ white[..., 1:]
+        after = 0.5 * (after + after.mT) * (self.keep[:, None] * self.keep)
         grown = torch.diag(self.growth) + unrest[:, None, None] * torch.diag(self.stirs)
-        return change, covariance * (self.keep[:, None] * self.keep) + grown, unrest
+        return change.float(), (after + grown).float(), unrest.float()
 
     def _absorbed(
         self, memory: Adaptation, inputs: Tensor, surprise: Tensor, samples: int
@@ -314,7 +317,7 @@ class DisturbanceEstimator:
         Covariance matching: the logarithm integrates by how much innovations are stronger than
         expected, so that it rests where they are as expected.
         """
-        prior, shapes = self.prior, self.moving
+        prior, shapes = self.prior, self.moving.to(power)
         found = (surprise @ shapes).square()
         strength = found / (shapes * (power @ shapes)).sum(1)
         beyond = strength.mean(1).clamp(max=prior.startling) / prior.innovation - 1.0

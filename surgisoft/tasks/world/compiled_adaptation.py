@@ -1,8 +1,9 @@
-"""The measurement and time update of `adaptation` for all arms of a batch, compiled.
+"""The update of the Kalman filter of `adaptation` for all arms of a batch, compiled.
 
-One arm's covariance stays in the processor's cache from the first product to the last, and only
-half of the symmetric products is computed. `adaptation` has the same equations in tensor operations,
-which are the reference, and which take other devices, gradients and exports. Arrays are float32.
+The covariance of one arm stays in the processor's cache from the first product to the last, and
+symmetric products are computed for one half. `adaptation` has the same equations as tensor
+operations: they are the reference, and serve other devices, gradients and exports. Arrays are
+float32, and what is computed between them float64, as there.
 """
 
 from __future__ import annotations
@@ -35,28 +36,29 @@ def learn(
 ):
     """Change of the mean, next covariance and next variance of transients of B arms.
 
-    inputs (B, D, k) mm; covariance (B, k, k), symmetric; surprise (B, D) mm; unrest (B,); noise:
-    variance of a measured coordinate, mm^2. shapes (M, D), rows of unit length: the directions in
-    which innovations are compared with their variance. rules: step over the time constant of
-    `unrest`, expected and largest ratio, least and largest `unrest`. keep, growth, stirs (k,):
-    factor of a state in a step, and what its variance grows by, always and for `unrest` = 1. Fills
-    change (B, k), after (B, k, k) and stirred (B,).
+    See `DisturbanceEstimator.updated`. inputs (B, D, k) mm; covariance (B, k, k), symmetric;
+    surprise (B, D) mm; unrest (B,); noise: variance of a measured coordinate, mm^2. shapes (M, D),
+    rows of unit length: the directions in which innovations are compared with their variance.
+    rules: step over the time constant of `unrest`, expected and largest ratio, least and largest
+    `unrest`. keep, growth, stirs (k,): factor of a state in a step, and what its variance grows by,
+    always and for `unrest` = 1. Fills change (B, k), after (B, k, k) and stirred (B,).
     """
     count, size, k = inputs.shape
-    across, power = np.empty((size, k), np.float32), np.empty((size, size), np.float32)
-    white = np.empty(size, np.float32)
+    across, power = np.empty((size, k)), np.empty((size, size))
+    rows, white, grown = np.empty((size, k)), np.empty(size), np.empty(k)
     rate, innovation, startling, quietest, liveliest = rules
     for b in range(count):
-        _product(inputs[b], covariance[b], across)
+        rows[:] = inputs[b]
+        _product(rows, covariance[b], across)
         for d in range(size):
             for e in range(d + 1):
-                total = np.float32(0.0)
+                total = 0.0
                 for j in range(k):
-                    total += across[d, j] * inputs[b, e, j]
+                    total += across[d, j] * rows[e, j]
                 power[d, e] = power[e, d] = total
             power[d, d] += noise
         ratio = _strength(shapes, surprise[b], power)
-        beyond = min(ratio, startling) / innovation - np.float32(1.0)
+        beyond = min(ratio, startling) / innovation - 1.0
         stirred[b] = min(max(unrest[b] * math.exp(rate * beyond), quietest), liveliest)
         _whiten(power, surprise[b], across, white)
         for j in range(k):
@@ -64,9 +66,9 @@ def learn(
         for d in range(size):
             for j in range(k):
                 change[b, j] += white[d] * across[d, j]
-        _subtract(covariance[b], across, keep, after[b])
         for i in range(k):
-            after[b, i, i] += growth[i] + stirred[b] * stirs[i]
+            grown[i] = growth[i] + stirred[b] * stirs[i]
+        _subtract(covariance[b], across, keep, grown, after[b])
 
 
 @compiled(reorder=True)
@@ -94,17 +96,17 @@ def _product(rows, matrix, out):
 @compiled(reorder=True)
 def _strength(shapes, surprise, power):
     """Mean over the shapes (M, D) of an innovation's square over its variance."""
-    total = np.float32(0.0)
+    total = 0.0
     for shape in shapes:
-        found = expected = np.float32(0.0)
+        found = expected = 0.0
         for d in range(len(shape)):
             found += shape[d] * surprise[d]
-            row = np.float32(0.0)
+            row = 0.0
             for e in range(len(shape)):
                 row += power[d, e] * shape[e]
             expected += shape[d] * row
         total += found * found / expected
-    return total / np.float32(len(shapes))
+    return total / len(shapes)
 
 
 @compiled(reorder=True)
@@ -128,28 +130,31 @@ def _whiten(power, surprise, across, white):
         for e in range(d):
             total -= power[d, e] * power[d, e]
         power[d, d] = math.sqrt(total)
-        each = np.float32(1.0) / power[d, d]
+        each = 1.0 / power[d, d]
         white[d] = each * value
         for j in range(k):
             across[d, j] *= each
 
 
 @compiled(reorder=True)
-def _subtract(matrix, rows, keep, out):
-    """keep (matrix - rows' rows) keep, of a symmetric matrix (k, k) and rows (D, k), into out.
+def _subtract(matrix, rows, keep, grown, out):
+    """keep (matrix - rows' rows) keep + grown, of a symmetric matrix (k, k), into out (k, k).
 
-    keep: (k,), the diagonal of a matrix. D is a multiple of 3, as there are that many coordinates.
+    rows: (D, k); D is a multiple of 3, as there are that many coordinates. keep and grown (k,) are
+    diagonals. One rounding to float32: of two, over many steps, an error of `grown` would be left.
     """
     size, k = rows.shape
+    row = np.empty(k)
     for i in range(k):
         for j in range(i + 1):
-            out[i, j] = matrix[i, j]
+            row[j] = matrix[i, j]
         for d in range(0, size, 3):
             a, b, c = rows[d, i], rows[d + 1, i], rows[d + 2, i]
             for j in range(i + 1):
-                out[i, j] -= a * rows[d, j] + b * rows[d + 1, j] + c * rows[d + 2, j]
-        for j in range(i + 1):
-            out[i, j] *= keep[i] * keep[j]
+                row[j] -= a * rows[d, j] + b * rows[d + 1, j] + c * rows[d + 2, j]
+        for j in range(i):
+            out[i, j] = row[j] * keep[i] * keep[j]
+        out[i, i] = row[i] * keep[i] * keep[i] + grown[i]
     for i in range(k):
         for j in range(i):
             out[j, i] = out[i, j]

@@ -5,6 +5,8 @@ What a diagnosis names is decided by a fitted model (`decision`); its numbers st
 the search that proposes effects, generously, to that model, and the costs that its probabilities
 are weighed with. None of them was fitted to cases whose results are reported, but for the costs of
 a wrong name, a needless name and a wrong "unknown", which every fit chooses inside its own cases.
+`python -m benchmarks.decision.stated_values` prints what results a halved and a doubled value of
+`Claim` and `Worth` changes (docs/results/decision.md).
 
 Gains are shares of what can be explained of the held-out squared error (what lies above the noise
 floor). Sizes are errors above the noise floor in units of the model discrepancy, which is the

@@ -1,11 +1,12 @@
 """The fit and the report of the decision, against independent formulas and by hand."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, fields, replace
 
 import numpy as np
 import pytest
 
+from benchmarks.decision import stated_values
 from benchmarks.decision.evidence_log import (
     EVIDENCE,
     JUDGED,
@@ -42,15 +43,20 @@ from benchmarks.decision.table import (
     rate,
     serious,
 )
+from surgisoft.diagnosis.criteria import CLAIM, Claim, Worth
 from surgisoft.diagnosis.decision import (
     ASSET,
+    CHOSEN_COSTS,
     FEATURES,
     Curve,
     Decision,
     Logistic,
     Probabilities,
+    chosen,
     content_hash,
     features_of,
+    fitted_decision,
+    probabilities,
 )
 from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.errors import InputError
@@ -359,6 +365,36 @@ def test_the_stored_evidence_gives_the_weights_of_the_asset(name):
     model = fit_one(name, sample(name, in_order(stored())), one["penalty"], one["twin_weight"])
     assert model.constant == pytest.approx(one["constant"], abs=0.01)
     assert model.weights == pytest.approx(list(one["weights"].values()), abs=0.01)
+
+
+def test_stated_values_are_varied_one_at_a_time():
+    worth = fitted_decision().worth
+    tried = list(stated_values.variants(worth))
+    names = {field.name for some in (Claim, Worth) for field in fields(some)}
+    assert {name for name, *_ in tried} == names - set(CHOSEN_COSTS) - {"half_pair"}
+    for name, value, other, costs, claim in tried:
+        both = asdict(costs) | asdict(claim)
+        default = asdict(worth) | asdict(CLAIM)
+        assert {key for key in both if both[key] != default[key]} == {name}
+        assert (both[name], default[name]) == (other, value)
+    assert stated_values.changed("near_floor", 1.3, 2.0) == pytest.approx(1.6)
+    assert stated_values.changed("least_probability", 0.7, 2.0) < 1.0
+    assert stated_values.changed("wrong_nothing", -2.0, 0.5) == -1.0
+
+
+def test_a_stated_value_changes_the_results_that_it_decides():
+    """Where "nothing is missing" may never be claimed, just these results change."""
+    worth = fitted_decision().worth
+    cases = [case for case in stored()["own_rig"] if case.label == "clean"][:8]
+    some = [
+        (case, chances := probabilities(case.evidence), chosen(case.evidence, chances, worth))
+        for case in cases
+    ]
+    assert stated_values.row(some, worth, CLAIM) == "0 | +0 | +0"
+    never = replace(CLAIM, most_over_validated=0.0)
+    quiet = sum(found.kind == "nothing_missing" for _, _, found in some)
+    assert quiet > 0
+    assert int(stated_values.row(some, worth, never).split(" | ")[0]) == quiet
 
 
 def test_robots_that_judge_took_no_part_in_the_fit():

@@ -268,7 +268,7 @@ def _form(found: Assessment) -> Section:
     verdict = found.diagnosis.verdict
     rows = [
         (each.effect, Share(each.confidence), Share(each.gain_alone), _mm(each.heldout_rmse_mm))
-        for each in found.diagnosis.ranking[:6]
+        for each in found.diagnosis.shown[:6]
     ]
     header = ["effect", "confidence", "explains alone", "held-out error with it"]
     notes = [*found.diagnosis.notes, *found.diagnosis.checks]

@@ -1,14 +1,18 @@
-"""Style sheet of the pages: one column, light or dark theme, from phone to desktop."""
+"""Style sheet of the pages: one column, light or dark theme, from phone to desktop.
+
+An element that is wider than the page scrolls; a shadow marks the side on which it goes on, by two
+backgrounds that scroll with it over two that do not (L. Verou 2012, "Pure CSS scrolling shadows").
+"""
 
 INK, MUTED, LINE = "#1d2329", "#5c6670", "#d5dade"
 DARK_INK, DARK_MUTED, DARK_LINE = "#e4e8ec", "#9aa5b0", "#38414a"
 
 STYLE = f"""
 :root{{--ink:{INK};--muted:{MUTED};--line:{LINE};--paper:#ffffff;--card:#f4f6f8;--accent:#2f6fb0;
---good:#2e7d4f;--warn:#b7791f;--bad:#b83b4b}}
+--good:#2e7d4f;--warn:#b7791f;--bad:#b83b4b;--edge:#1d232955}}
 @media (prefers-color-scheme:dark){{:root{{--ink:{DARK_INK};--muted:{DARK_MUTED};
 --line:{DARK_LINE};--paper:#14181c;--card:#1d2329;--accent:#6aa9e9;--good:#59b884;--warn:#dba84a;
---bad:#e57383}}}}
+--bad:#e57383;--edge:#e4e8ec66}}}}
 *{{box-sizing:border-box}}
 body{{margin:0;background:var(--paper);color:var(--ink);
 font:16px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,"Helvetica Neue",Arial,sans-serif}}
@@ -28,9 +32,13 @@ a{{color:var(--accent)}}
 gap:12px;margin:16px 0}}
 .facts div{{background:var(--card);border-radius:4px;padding:10px 14px}}
 dd{{margin:0;font-size:1.25rem;font-variant-numeric:tabular-nums;overflow-wrap:anywhere}}
-.wide{{overflow-x:auto;margin:0 0 16px}}
-pre{{margin:0 0 12px;padding:10px 14px;overflow-x:auto;background:var(--card);border-radius:4px;
-font-size:.875rem}}
+.wide{{overflow-x:auto;margin:0 0 16px;background:
+linear-gradient(90deg,var(--paper) 40%,transparent) 0 0/40px 100% no-repeat local,
+linear-gradient(270deg,var(--paper) 40%,transparent) 100% 0/40px 100% no-repeat local,
+linear-gradient(90deg,var(--edge),transparent) 0 0/12px 100% no-repeat scroll,
+linear-gradient(270deg,var(--edge),transparent) 100% 0/12px 100% no-repeat scroll}}
+pre{{margin:0 0 12px;padding:10px 14px;background:var(--card);border-radius:4px;
+font-size:.875rem;white-space:pre-wrap;overflow-wrap:anywhere}}
 figure .wide{{margin:0 0 4px}}
 .long{{min-width:11em}}
 table{{border-collapse:collapse;font-size:.9rem;font-variant-numeric:tabular-nums}}

@@ -106,8 +106,9 @@ def test_improve_gives_one_result(lab):
     assert places == sorted(places)
     first, *others = improved.diagnoses[0].ranking
     assert f"By itself, {first.effect} leaves {first.heldout_rmse_mm:.3f} mm" in text
-    least = min(other.heldout_rmse_mm for other in others)
-    assert f"leaves least, {least:.3f} mm" in text
+    least = min(others, key=lambda other: other.heldout_rmse_mm)
+    assert f"{least.effect} leaves least, {least.heldout_rmse_mm:.3f} mm" in text
+    assert f">{least.effect}</td>" in text
     assert ("<td>added</td>" in text) == bool(improved.steps)
     for name in ("story/bodies.png", "story.rrd"):
         assert (lab / name).stat().st_size > 10_000

@@ -1,12 +1,15 @@
 """Pages stand alone, escape what they are told, and fit a telephone."""
 
+import io
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from surgisoft.errors import InputError
 from surgisoft.report import (
+    Command,
     Facts,
     Gallery,
     Page,
@@ -124,3 +127,30 @@ def test_page_in_a_browser(tmp_path):
             assert broken == 0
             colours.add(colour)
         assert len(colours) == 2
+
+
+def test_a_narrow_page_wraps_commands_and_marks_what_goes_on(tmp_path):
+    """A table that is wider than a telephone has a shadow on the side that it can scroll to."""
+    table = Table([f"column {n}" for n in range(12)], [[f"value {n}" for n in range(12)]])
+    command = Command("surgisoft amend default --effect creep --data monday.parquet -o amended")
+    path = write_page(Page("a", "b", [Section("One", [command, table])]), tmp_path / "a.html")
+    with chromium() as browser:
+        page = browser.new_page(viewport={"width": 400, "height": 900})
+        page.goto(path.as_uri())
+        assert page.evaluate("(e => e.scrollWidth <= e.clientWidth)(document.querySelector('pre'))")
+        box = page.locator(".wide").bounding_box()
+
+        def edges():
+            """Darkest pixels of the columns left and right of the table's last line."""
+            found = []
+            for x in (box["x"], box["x"] + box["width"] - 1):
+                at = {"x": x, "y": box["y"] + 4, "width": 1, "height": 4}
+                shown = Image.open(io.BytesIO(page.screenshot(clip=at))).convert("L")
+                found.append(int(np.asarray(shown).min()))
+            return found
+
+        left, right = edges()
+        assert (left, right < 230) == (255, True)
+        page.evaluate("document.querySelector('.wide').scrollLeft = 10000")
+        left, right = edges()
+        assert (left < 230, right) == (True, 255)

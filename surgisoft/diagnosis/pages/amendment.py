@@ -301,7 +301,7 @@ def _missing(result: Improvement) -> Section:
             Share(each.gain_alone),
             "added" if each.effect in added else _why_not(each.effect, first),
         )
-        for each in first.ranking[:MOST_WORDS]
+        for each in first.shown[:MOST_WORDS]
     ]
     sentence = first.verdict.sentence
     words = [f"{sentence[:1].upper()}{sentence[1:]}."]

@@ -153,7 +153,7 @@ def _along(result: Comparison, table: ResidualTable) -> Section:
     rows = []
     for k, way in enumerate(arc_length(table)):
         band = bands.get(float(way))
-        bias = ["-"] * 3 if band is None else [f"{value:+.3f}" for value in band.bias_mm]
+        bias = ["-"] * 3 if band is None else [f"{value:+z.3f}" for value in band.bias_mm]
         error = _mm(result.per_key_point_mm[k])
         rows.append((f"k{k}", f"{way:.1f} mm", error, *bias))
     header = ["key point", "along the arm", "error"]

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from surgisoft.diagnosis.cross_validation import (
+    PERSISTENCE,
     ROOM,
     cross_validation_of,
     static_features,
@@ -61,20 +62,21 @@ def black_box(problem: Problem) -> BlackBox:
     static = static_features(problem.pressure, problem.direction)
     beyond = problem.rmse_mm / max(float(np.sqrt(np.mean(problem.discrepancy_mm**2))), 1e-12)
     rooms = tuple(ROOM * factor * max(1.0, beyond) for factor in FREE_ERROR_FACTORS)
-    null = cross_validation_of(problem)
+    alone = cross_validation_of(problem, features=static, rooms=(ROOM, *rooms))
 
     def learnt(scale: float, rooms: tuple[float, ...]) -> list[np.ndarray]:
-        """Held-out losses (B,) with features of one scale at each ridge; 0: static ones alone."""
-        both = np.concatenate([static, scale * wide], axis=1) if scale else static
+        """Held-out losses (B,) with features of one scale beside the static ones at each ridge."""
+        both = np.concatenate([static, scale * wide], axis=1)
         return list(cross_validation_of(problem, features=both, rooms=rooms).level_losses())
 
-    tried = [null.losses()]
+    validated, beyond_it = np.split(alone.level_losses(), [len(PERSISTENCE)])
+    tried = [min(validated, key=np.sum)]
     for scale in FEATURE_SCALES:
         tried += learnt(scale, (ROOM,))
-    memoryless = [tried[0], *learnt(0.0, rooms)]
+    memoryless = [tried[0], *beyond_it]
     free = [*tried, *memoryless, *learnt(FREE_SCALE, rooms)]
     best = min(tried, key=np.sum)
-    floor = null.counts * problem.floor_mm**2
+    floor = alone.counts * problem.floor_mm**2
     gain = np.log((tried[0] + floor) / (best + floor))[None]
     chance = float(sign_flip_p_values(problem.by_motion(gain))[0]) if gain.any() else 1.0
     least = min(free, key=np.sum), min(memoryless, key=np.sum)

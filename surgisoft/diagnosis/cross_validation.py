@@ -7,7 +7,7 @@ that are computed once: trying a set costs a small linear solve. Of rows that ar
 fold's fit, products are taken once and subtracted from those of all.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -29,6 +29,8 @@ PERSISTENCE = (5.0, 50.0, 500.0)
 """Rows over which the remaining error is correlated: it holds the discrepancy back so many times
 more than white noise of its size. The one that does best on held-out blocks is taken."""
 
+STRIP = 1 << 20
+"""Numbers of a field that are worked through at once: 4 MB, of which the cache holds a few."""
 REFERENCE_WEIGHT = 3.0
 """Weight of a reference's rows: an error that changed since is not shared out over both."""
 FITTED = -1
@@ -60,6 +62,10 @@ class Basis:
 class Split:
     """Rows that are fitted and held out in turn, and what is the same for every effect."""
 
+    order: np.ndarray
+    """(rows,) the rows that are held out in turn, fold by fold and block by block: everything here
+    lies in this order, so that the rows of a fold and of a block are slices. Rows that are never
+    held out come behind them."""
     features: np.ndarray
     """(S, F) features of the static part."""
     residual: np.ndarray
@@ -67,11 +73,13 @@ class Split:
     seen: np.ndarray
     """(S, n) which key points were measured."""
     block: np.ndarray
-    """(S,) block of each row; rows that are never held out come last."""
+    """(S,) block of each row."""
     fold: np.ndarray
     """(B,) fold of each block that is held out, from 0."""
-    held: list[np.ndarray]
+    held: list[slice]
     """The rows that each fold holds out."""
+    blocks: list[list[tuple[int, slice]]]
+    """The blocks that each fold holds out, and their rows."""
     ridges: np.ndarray
     """(L, n) ridge on the features of each key point, for each room and each of PERSISTENCE."""
     bases: list[list[Basis]]
@@ -110,20 +118,40 @@ class Split:
         )
         held_out = np.unique(fold[fold != FITTED], return_inverse=True)[1]
         owner = np.append(held_out, FITTED)[np.minimum(block, len(held_out))]
-        held = [np.flatnonzero(owner == number) for number in range(held_out.max() + 1)]
-        groups, which = np.unique(seen, axis=1, return_inverse=True)
-        alike = [np.flatnonzero(which.reshape(-1) == g) for g in range(groups.shape[1])]
-        bases: list[list[Basis]] = []
-        for number in range(len(held)):
-            some = [features[(owner != number) & seen[:, points[0]]] for points in alike]
-            found = [linalg.eigh(rows.T @ rows, check_finite=False) for rows in some]
-            bases.append([Basis(p, *pair) for p, pair in zip(alike, found, strict=True)])
-        return cls(features, residual, seen, block, held_out, held, ridges, bases)
+        rows = int((owner != FITTED).sum())
+        order = np.lexsort((block[:rows], owner[:rows]))
+        everything = np.concatenate([order, np.arange(rows, len(block))])
+        features, residual, seen = features[everything], residual[everything], seen[everything]
+        block, owner = block[everything], owner[everything]
+        held, blocks = [], []
+        for number in range(held_out.max() + 1):
+            held.append(_where(owner[:rows] == number))
+            own = np.unique(block[held[-1]])
+            blocks.append([(int(one), _where(block[:rows] == one)) for one in own])
+        bases = _bases(features, seen, held)
+        return cls(order, features, residual, seen, block, held_out, held, blocks, ridges, bases)
 
     @property
     def rows(self) -> int:
-        """Rows that are held out in turn."""
-        return int((self.block < len(self.fold)).sum())
+        """Number of rows that are held out in turn."""
+        return len(self.order)
+
+    def laid_out(self, given: Sequence[np.ndarray], room: int = 0) -> np.ndarray:
+        """(rows, n, 3, room + K) fields (rows, n, 3, k) side by side, in this order.
+
+        0 where nothing was measured; the first `room` columns are left to be filled.
+        """
+        count = room + sum(each.shape[3] for each in given)
+        answer = np.empty((self.rows, *self.residual.shape[1:], count), np.float32)
+        # Block by block: a block of rows stays in the cache while its columns are interleaved.
+        for _, rows in (one for blocks in self.blocks for one in blocks):
+            some, first = _at_once(self.order[rows]), room
+            for each in given:
+                answer[rows, ..., first : first + each.shape[3]] = each[some]
+                first += each.shape[3]
+        if not self.seen[: self.rows].all():
+            answer[..., room:][~self.seen[: self.rows]] = 0.0
+        return answer
 
     def turned(self, field: np.ndarray, known: np.ndarray | None = None) -> list[np.ndarray]:
         """Products of the static part's basis and a field (rows, n, 3, C), fold by fold.
@@ -147,34 +175,82 @@ class Split:
             answer.append(left)
         return answer
 
-    def shrunk(self, turned: np.ndarray, number: int, level: int) -> np.ndarray:
-        """Coefficients of a fold's static part: products as of `turned` over a level's ridge."""
-        answer = np.empty_like(turned)
+    def weight(self, number: int, level: int) -> np.ndarray:
+        """(F, n) what divides the products of `turned` in a fold's fit at a level's ridge."""
+        answer = np.empty((self.features.shape[1], self.seen.shape[1]), np.float32)
         for basis in self.bases[number]:
-            ridge = self.ridges[level, basis.points]
-            weight = np.maximum(basis.values, 0.0)[:, None] + ridge
-            at = _at_once(basis.points, turned.shape[1])
-            answer[:, at] = turned[:, at] / weight[..., None, None]
+            values = np.maximum(basis.values, 0.0)[:, None]
+            answer[:, basis.points] = values + self.ridges[level, basis.points]
         return answer
 
-    def away(self, field: np.ndarray, shrunk: np.ndarray, number: int) -> np.ndarray:
-        """(s, n, 3, C) what a fold's static fit leaves of a field (s, n, 3, C) on the rows that the
-        fold holds out."""
-        rows = self.held[number]
-        answer = np.empty_like(field)
+    def _own(self, number: int, rows: slice) -> list[np.ndarray]:
+        """(s, F) features of some rows of a fold, rotated, for each of the fold's bases."""
+        held, answer = self.held[number], []
         for place, basis in enumerate(self.bases[number]):
             if (number, place) not in self.rotated:
-                self.rotated[number, place] = self.features[rows] @ basis.vectors
+                self.rotated[number, place] = self.features[held] @ basis.vectors
             own = self.rotated[number, place]
-            at = _at_once(basis.points, field.shape[1])
-            part = own @ shrunk[:, at].reshape(len(shrunk), -1)
-            part = part.reshape(len(rows), len(basis.points), *field.shape[2:])
-            if len(basis.points) == field.shape[1]:
-                answer = np.subtract(field, part, out=part)
-            else:
-                answer[:, at] = field[:, at] - part
-        answer[~self.seen[rows]] = 0.0
+            answer.append(own[rows.start - held.start : rows.stop - held.start])
         return answer
+
+    def by_basis(self, coefficients: np.ndarray, number: int) -> list[np.ndarray]:
+        """(F, p 3 C) coefficients (F, n, 3, C) of a fold's static fit, for each of its bases."""
+        size = len(coefficients)
+        return [coefficients[:, _at_once(b.points)].reshape(size, -1) for b in self.bases[number]]
+
+    def away(
+        self, field: np.ndarray, coefficients: list[np.ndarray], number: int, rows: slice
+    ) -> np.ndarray:
+        """(s, n, 3, C) what a fold's static fit leaves of a field (s, n, 3, C) on some of the rows
+        that the fold holds out.
+
+        coefficients: those of the fit by basis.
+        """
+        answer = np.empty_like(field)
+        own = self._own(number, rows)
+        for basis, features, each in zip(self.bases[number], own, coefficients, strict=True):
+            at = _at_once(basis.points)
+            some = field[:, at]
+            part = (features @ each).reshape(some.shape)
+            if some.shape == field.shape:
+                answer = np.subtract(some, part, out=part)
+            else:
+                np.subtract(some, part, out=part)
+                answer[:, at] = part
+        if not self.seen[rows].all():
+            answer[~self.seen[rows]] = 0.0
+        return answer
+
+    def projected(self, field: np.ndarray, number: int, rows: slice) -> np.ndarray:
+        """(F, n, 3, C) products of a fold's rotated features and a field (s, n, 3, C) on some of
+        the rows that the fold holds out."""
+        answer = np.empty((self.features.shape[1], *field.shape[1:]), np.float32)
+        for basis, own in zip(self.bases[number], self._own(number, rows), strict=True):
+            at = _at_once(basis.points)
+            some = field[:, at]
+            answer[:, at] = (own.T @ some.reshape(len(some), -1)).reshape(-1, *some.shape[1:])
+        return answer
+
+
+def _bases(features: np.ndarray, seen: np.ndarray, held: list[slice]) -> list[list[Basis]]:
+    """The static fits to all rows (S, F) but those that each fold holds out, which come first.
+
+    seen: (S, n) which key points were measured; those that were measured together share a fit.
+    """
+    groups, which = np.unique(seen, axis=1, return_inverse=True)
+    bases: list[list[Basis]] = [[] for _ in held]
+    parts = [*held, slice(held[-1].stop, None)]
+    for g, measured in enumerate(groups.T):
+        points = np.flatnonzero(which.reshape(-1) == g)
+        grams = []
+        for rows in parts:
+            some = features[rows] if measured[rows].all() else features[rows][measured[rows]]
+            grams.append(some.T @ some)
+        whole = np.sum(grams, axis=0)
+        for number in range(len(held)):
+            found = linalg.eigh(whole - grams[number], check_finite=False)
+            bases[number].append(Basis(points, *found))
+    return bases
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,32 +277,26 @@ class CrossValidation:
         """The cross-validation of sensitivities (rows, n, 3, K), or of several such arrays side by
         side, on a split."""
         given = [sensitivities] if isinstance(sensitivities, np.ndarray) else sensitivities
-        count = sum(each.shape[3] for each in given)
-        both = np.empty((*split.residual[: split.rows].shape, 1 + count), np.float32)
+        both = split.laid_out(given, room=1)
         both[..., 0] = split.residual[: split.rows]
-        first = 1
-        for each in given:
-            both[..., first : first + each.shape[3]] = each
-            first += each.shape[3]
-        both[~split.seen[: split.rows]] = 0.0
         known = split.residual[split.rows :]
         turned = split.turned(both, known)
-        grams, lines = _products(split, (both,), turned, (both,), turned)
+        grams, lines = _products(split, both, turned)
         grams[:, :, 0, 0] += np.square(known, dtype=float).sum()
-        none = np.empty((len(lines), 1 + count, 0, lines.shape[2]), np.float32)
+        none = np.empty((len(lines), both.shape[3], 0, lines.shape[2]), np.float32)
         return cls(split, (both,), grams, HeldOut(lines, none), turned)
 
     def extended(self, sensitivities: np.ndarray) -> "CrossValidation":
         """This cross-validation with further sensitivities (rows, n, 3, K') after its own."""
-        more = _masked(self.split, sensitivities)
+        more = self.split.laid_out([sensitivities])
         fields = (*self.fields, more)
         turned = self.split.turned(more)
         whole = [np.concatenate(pair, axis=3) for pair in zip(self.turned, turned, strict=True)]
-        grams, lines = _products(self.split, fields, whole, (more,), turned)
-        border = lines.reshape(len(lines), *grams.shape[2:], -1)
+        grams, border = _products_with(self.split, fields, whole, more, turned)
         grams = _bordered(self.grams, grams)
-        held_out = self.held_out.extended(border)
-        return CrossValidation(self.split, fields, grams, held_out, whole, dict(self.cache))
+        return CrossValidation(
+            self.split, fields, grams, self.held_out.extended(border), whole, dict(self.cache)
+        )
 
     def level_losses(self) -> np.ndarray:
         """(L, B) held-out sum of squared distances, mm^2, of the features alone at each ridge."""
@@ -336,66 +406,106 @@ def _rising(chosen: Sequence[int] | np.ndarray) -> np.ndarray:
     return np.array(sorted(set(map(int, chosen))), int)
 
 
-def _masked(split: Split, sensitivities: np.ndarray) -> np.ndarray:
-    """Columns (rows, n, 3, K) in single precision, 0 where nothing was measured."""
-    answer = sensitivities.astype(np.float32)
-    answer[~split.seen[: split.rows]] = 0.0
-    return answer
+def _products(
+    split: Split, field: np.ndarray, turned: list[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """(grams, lines) of the C columns of a field (rows, n, 3, C) with `turned` products.
 
-
-def _side_by_side(fields: Sequence[np.ndarray], rows: np.ndarray) -> np.ndarray:
-    """(s, n, 3, C) some rows of fields (rows, n, 3, c)."""
-    if len(fields) == 1:
-        return fields[0][rows]
-    return np.concatenate([each[rows] for each in fields], axis=3)
-
-
-def _products(split: Split, a, turned_a, b, turned_b) -> tuple[np.ndarray, np.ndarray]:
-    """(grams, lines) of the columns of two sets of fields (rows, n, 3, .), A and B in number.
-
-    grams: (L, folds, A, B) as in CrossValidation. lines: (L, A B, blocks) products on each held-out
-    block; where both sets are the same one, (L, A (A + 1) / 2, blocks), as in HeldOut.
+    grams: (L, folds, C, C) as in CrossValidation. lines: (L, C (C + 1) / 2, blocks) as in HeldOut.
     """
-    levels, folds = len(split.ridges), len(split.bases)
-    size = (turned_a[0].shape[3], turned_b[0].shape[3])
-    same = a is b or (len(a) == len(b) and all(x is y for x, y in zip(a, b, strict=True)))
-    count = size[0] * (size[0] + 1) // 2 if same else size[0] * size[1]
-    parts = np.empty((folds, *size))
-    grams = np.empty((levels, folds, *size))
-    answer = np.empty((levels, count, len(split.fold)), np.float32)
-    by_block = np.empty((len(split.fold), count), np.float32)
+    levels, folds, size = len(split.ridges), len(split.held), field.shape[3]
+    parts = np.empty((folds, size, size))
+    for number, held in enumerate(split.held):
+        parts[number] = _product(field[held], field[held])
+    grams = np.empty((levels, folds, size, size))
+    lines = np.empty((levels, size * (size + 1) // 2, len(split.fold)), np.float32)
+    by_block = np.empty((len(split.fold), lines.shape[1]), np.float32)
     for level in range(levels):
-        for number, rows in enumerate(split.held):
-            own_b = _side_by_side(b, rows)
-            own_a = own_b if same else _side_by_side(a, rows)
-            if not level:
-                parts[number] = _product(own_a, own_b)
-            mine = split.shrunk(turned_b[number], number, level)
-            grams[level, number] = _product(turned_a[number], mine)
-            right = split.away(own_b, mine, number)
-            left = right
-            if not same:
-                left = split.away(own_a, split.shrunk(turned_a[number], number, level), number)
-            block = split.block[rows]
-            for one in np.unique(block):
-                own = _at_once(np.flatnonzero(block == one))
-                if same:
-                    some = right[own]
-                    _lower(_product(some, some), by_block[one])
-                else:
-                    by_block[one] = _product(left[own], right[own]).reshape(-1)
+        for number in range(folds):
+            root = np.sqrt(split.weight(number, level))[..., None, None]
+            shrunk = turned[number] / root
+            grams[level, number] = _product(shrunk, shrunk)
+            shrunk /= root
+            coefficients = split.by_basis(shrunk, number)
+            for strip, blocks in _strips(split.blocks[number], field[0].size):
+                left = split.away(field[strip], coefficients, number, strip)
+                for one, rows in blocks:
+                    own = left[rows.start - strip.start : rows.stop - strip.start]
+                    _lower(_product(own, own), by_block[one])
         # A set of columns is then looked up in lines of all blocks, which the cache holds.
-        _transpose(by_block, answer[level])
+        _transpose(by_block, lines[level])
     np.subtract(parts.sum(axis=0) - parts, grams, out=grams)
-    return grams, answer
+    return grams, lines
 
 
-def _at_once(places: np.ndarray, count: int | None = None) -> np.ndarray | slice:
-    """Rising places as a slice, which copies nothing, where they have no gaps.
+def _products_with(
+    split: Split,
+    fields: Sequence[np.ndarray],
+    whole: list[np.ndarray],
+    more: np.ndarray,
+    turned: list[np.ndarray],
+) -> tuple[np.ndarray, np.ndarray]:
+    """(grams, border) of the columns of all fields with A columns of one more, itself among them.
 
-    count: of all places; a slice then is only taken for all of them.
+    fields: (rows, n, 3, c), C columns in all, the A of `more` last; whole and turned: products of
+    all of them and of `more` as of `Split.turned`. grams: (L, folds, C, A) as in CrossValidation;
+    border: (L, C, A, blocks) products on each held-out block, as `HeldOut.extended` takes them. The
+    static part is taken from the A columns alone: what it leaves of two columns has the product
+
+        (x - P x)' (y - P y) = x' (y - P y) - x' P' (y - P y)
+
+    and P y on the rows of a block follows from the few products `turned`.
     """
-    if len(places) != (places[-1] - places[0] + 1 if count is None else count):
+    levels, folds = len(split.ridges), len(split.held)
+    count, size = whole[0].shape[3], more.shape[3]
+    parts = np.empty((folds, count, size))
+    grams = np.empty((levels, folds, count, size))
+    border = np.empty((levels, count, size, len(split.fold)), np.float32)
+    for number, held in enumerate(split.held):
+        parts[number] = np.concatenate([_product(each[held], more[held]) for each in fields])
+        weights = [split.weight(number, level)[..., None, None] for level in range(levels)]
+        coefficients = []
+        for level, weight in enumerate(weights):
+            shrunk = turned[number] / weight
+            grams[level, number] = _product(whole[number], shrunk)
+            coefficients.append(split.by_basis(shrunk, number))
+        for one, rows in split.blocks[number]:
+            left = [split.away(more[rows], each, number, rows) for each in coefficients]
+            pulled = [
+                split.projected(each, number, rows) / weight
+                for each, weight in zip(left, weights, strict=True)
+            ]
+            right = np.concatenate(left, axis=3)
+            direct = np.concatenate([_product(each[rows], right) for each in fields])
+            direct -= _product(whole[number], np.concatenate(pulled, axis=3))
+            border[..., one] = np.moveaxis(direct.reshape(count, levels, size), 1, 0)
+    np.subtract(parts.sum(axis=0) - parts, grams, out=grams)
+    return grams, border
+
+
+def _strips(
+    blocks: Sequence[tuple[int, slice]], width: int
+) -> Iterator[tuple[slice, list[tuple[int, slice]]]]:
+    """Rows of a fold that are worked through at once, and their blocks; width: numbers in a row."""
+    strip: list[tuple[int, slice]] = []
+    for one, rows in blocks:
+        if strip and (rows.stop - strip[0][1].start) * width > STRIP:
+            yield slice(strip[0][1].start, strip[-1][1].stop), strip
+            strip = []
+        strip.append((one, rows))
+    if strip:
+        yield slice(strip[0][1].start, strip[-1][1].stop), strip
+
+
+def _where(chosen: np.ndarray) -> slice:
+    """The rows (S,) bool that are set, which lie together; an empty slice for none."""
+    places = np.flatnonzero(chosen)
+    return slice(int(places[0]), int(places[-1]) + 1) if len(places) else slice(0, 0)
+
+
+def _at_once(places: np.ndarray) -> np.ndarray | slice:
+    """Rising places as a slice, which copies nothing, where they have no gaps."""
+    if len(places) != places[-1] - places[0] + 1:
         return places
     return slice(int(places[0]), int(places[-1]) + 1)
 

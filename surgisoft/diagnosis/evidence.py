@@ -335,7 +335,7 @@ def collinearity(selection: ModelSelection, best: Score, other: Score) -> float:
     """
     seen = np.isfinite(selection.problem.residual)
     own = list(best.option.chosen)
-    change = selection.sensitivities(own) @ selection.validation.amplitudes(own)
+    change = selection.explained_mm(own, selection.validation.amplitudes(own))
     design = selection.sensitivities(other.option.chosen)[seen].astype(float)
     target = change[seen]
     gram = design.T @ design

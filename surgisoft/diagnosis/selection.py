@@ -168,6 +168,14 @@ class ModelSelection:
             answer[place] = self.candidates[number].sensitivities[..., own]
         return np.moveaxis(answer, 0, -1)
 
+    def explained_mm(self, chosen: Sequence[int], amplitudes: np.ndarray) -> np.ndarray:
+        """(S, n, 3) what some sensitivities explain at amplitudes (k,), mm."""
+        answer = np.zeros(self.problem.residual.shape)
+        for one, amplitude in zip(chosen, amplitudes, strict=True):
+            number, own = self._place[one]
+            answer += amplitude * self.candidates[number].sensitivities[..., own]
+        return answer
+
     def losses(self, chosen: tuple[int, ...] = ()) -> np.ndarray:
         """(B,) held-out sum of squared distances, mm^2, with the chosen sensitivities."""
         return self.validation.losses(chosen)
@@ -272,8 +280,7 @@ class ModelSelection:
     def _static_share(self, option: Option, base: tuple[int, ...]) -> float:
         """Share of what an effect explains that is a cubic of the actuation."""
         amplitudes = self._amplitudes(option, base)
-        part = self.sensitivities(option.chosen) @ amplitudes
-        part = part.reshape(len(part), -1)
+        part = self.explained_mm(option.chosen, amplitudes).reshape(len(self.problem.index), -1)
         part = part - part.mean(axis=0)
         known = self._cubics.T @ part
         return float(np.square(known).sum() / max(np.square(part).sum(), 1e-30))
@@ -377,7 +384,7 @@ def relaxed_fit(selection: ModelSelection, named: Sequence[Score]) -> RelaxedFit
     for scaled in (_by_state, _by_time):
         sensitivities = _relaxed_sensitivities(selection, named, scaled)
         validation = CrossValidation.on(selection.validation.split, sensitivities)
-        tried.append(validation.losses(range(sensitivities.shape[3])))
+        tried.append(validation.losses(range(validation.sensitivities)))
     return _beyond(selection, chosen_by(named), min(tried, key=np.sum))
 
 
@@ -404,12 +411,10 @@ def beside_relaxed(selection: ModelSelection, named: Sequence[Score], further: S
     The p-value counts this one effect alone.
     """
     chosen = further.option.chosen
-    sensitivities = [
-        _relaxed_sensitivities(selection, named, _by_state),
-        selection.sensitivities(chosen),
-    ]
-    together = np.concatenate(sensitivities, axis=3)
-    validation, total = CrossValidation.on(selection.validation.split, together), together.shape[3]
+    sensitivities = _relaxed_sensitivities(selection, named, _by_state)
+    sensitivities.append(selection.sensitivities(chosen))
+    validation = CrossValidation.on(selection.validation.split, sensitivities)
+    total = validation.sensitivities
     before, after = (validation.losses(range(n)) for n in (total - len(chosen), total))
     log_gain, chance = _fall(selection, before, after)
     gain = float((before.sum() - after.sum()) / selection.explainable(before, [after]))
@@ -418,17 +423,17 @@ def beside_relaxed(selection: ModelSelection, named: Sequence[Score], further: S
 
 def _relaxed_sensitivities(
     selection: ModelSelection, named: Sequence[Score], scaled: Scaled
-) -> np.ndarray:
-    """(S, n, 3, K) the named effects' sensitivities, and what each of them explains, scaled."""
+) -> list[np.ndarray]:
+    """(S, n, 3, k) each: the named effects' sensitivities; what each effect explains, scaled."""
     choices = [selection.freest(score) for score in named]
     base = sum(choices, ())
     amplitudes = selection.validation.amplitudes(base)
     sensitivities, first = [selection.sensitivities(base)], 0
     for chosen in choices:
-        part = selection.sensitivities(chosen) @ amplitudes[first : first + len(chosen)]
+        part = selection.explained_mm(chosen, amplitudes[first : first + len(chosen)])
         sensitivities.append(scaled(selection, part))
         first += len(chosen)
-    return np.concatenate(sensitivities, axis=3)
+    return sensitivities
 
 
 def _by_state(selection: ModelSelection, part: np.ndarray) -> np.ndarray:
@@ -583,8 +588,7 @@ class Selected:
         same = [p.chosen for p in self.proposals if set(p.effects) == set(effects)]
         alone = [score.option.chosen for score in self.first if score.effect in effects[:1]]
         chosen = next(iter(same + alone), ())
-        amplitudes = self.selection.validation.amplitudes(chosen)
-        return self.selection.sensitivities(chosen) @ amplitudes
+        return self.selection.explained_mm(chosen, self.selection.validation.amplitudes(chosen))
 
 
 @dataclass(frozen=True, eq=False)

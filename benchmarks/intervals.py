@@ -176,8 +176,9 @@ def run_case(case: Case, folder: Path) -> Outcome:
     torch.set_num_threads(1)
     base, setting = base_model(case.robot, folder), case.setting
     model = base
-    if setting.bent_mm > base.validation.rmse_mm:
-        model = bent(base, case.robot, setting.bent_mm, case.take)
+    arm = base if setting.law == "own" else None
+    if arm is not None or setting.bent_mm > base.validation.rmse_mm:
+        model = bent(base, case.robot, setting.bent_mm, case.take, arm)
     true: dict[str, np.ndarray] = {}
     if setting.law == "own":
         effect = drawn_effect(case.effect, base, case.take)

@@ -56,9 +56,27 @@ def validation_of(robot: int) -> History:
     return history_of([valid])
 
 
-def bent(model: ArmModel, robot: int, wanted_mm: float, seed: int) -> ArmModel:
-    """Copy of the model with a smooth static error, so that its validated error is `wanted_mm`."""
+@torch.no_grad()
+def measured_on(arm: ArmModel, history: History, seed: int) -> History:
+    """The same actuation with the key points that an arm model predicts, and cameras' noise."""
+    points = arm.predict(history)
+    generator = torch.Generator().manual_seed(seed)
+    size = history.noise_mm or 0.0
+    noise = size * torch.randn(points.shape, generator=generator)
+    seen = torch.isfinite(history.key_points)
+    return replace(history, key_points=torch.where(seen, points + noise, history.key_points))
+
+
+def bent(
+    model: ArmModel, robot: int, wanted_mm: float, seed: int, arm: ArmModel | None = None
+) -> ArmModel:
+    """Copy of the model with a smooth static error, so that its validated error is `wanted_mm`.
+
+    arm: the model that is the arm itself; default: the arm is that of the virtual rig.
+    """
     history = validation_of(robot)
+    if arm is not None:
+        history = measured_on(arm, history, robot)
     generator = torch.Generator().manual_seed(seed)
     noise = {
         name: torch.randn(value.shape, generator=generator) * value.std()

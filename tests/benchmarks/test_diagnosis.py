@@ -10,13 +10,14 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
+import torch
 
 from benchmarks.diagnosis import experiment as diagnosis_experiment
 from benchmarks.diagnosis import study as diagnosis
 from benchmarks.diagnosis.amend import Amended
 from benchmarks.diagnosis.cases import KNOWN, LEFT_OUT, UNKNOWN, Case, cases
 from benchmarks.diagnosis.experiment import Settled
-from benchmarks.diagnosis.robots import bent, record, record_experiment
+from benchmarks.diagnosis.robots import bent, record, record_experiment, validation_of
 from benchmarks.diagnosis.study import Outcome, read_outcomes, run, run_case, to_amend
 from benchmarks.diagnosis.table import calibration_error, markdown
 from surgisoft.diagnosis.design.next_experiment import Pair, Recommendation
@@ -73,6 +74,19 @@ def test_a_bent_surrogate_has_the_wanted_error():
     worse = bent(model, 0, 0.3, seed=4)
     assert worse.validation.rmse_mm == pytest.approx(0.3, rel=0.05)
     assert model.validation.rmse_mm < 0.15
+
+
+def test_a_bent_surrogate_of_an_arm_that_is_the_model_itself_is_off_by_the_wanted_error():
+    """The error of the model it was made from is no error of that arm. The cameras' noise counts in
+    a validated error; the distance from the arm has the rest of it."""
+    model = default_arm()
+    worse = bent(model, 0, 0.3, seed=4, arm=model)
+    assert worse.validation.rmse_mm == pytest.approx(0.3, rel=0.05)
+    history = validation_of(0)
+    with torch.no_grad():
+        away = (worse.predict(history) - model.predict(history)).square().sum(-1)
+    noise = 3.0 * history.noise_mm**2
+    assert away.mean().item() == pytest.approx(worse.validation.rmse_mm**2 - noise, rel=0.03)
 
 
 def test_correlated_noise_is_stated():

@@ -10,7 +10,9 @@ import torch
 from surgisoft.diagnosis.candidates import with_effect
 from surgisoft.diagnosis.estimation import network_error
 from surgisoft.diagnosis.estimation.effects import fit_effects
+from surgisoft.diagnosis.estimation.intervals import DRAWS, Fitted, intervals
 from surgisoft.diagnosis.estimation.least_squares import (
+    Fit,
     Prediction,
     free_parameters,
     repeated_scan,
@@ -103,6 +105,31 @@ def test_parameters_come_back_and_the_error_falls_to_the_noise(name):
     assert sum(inside) >= len(inside) - 1
     assert np.isfinite(wide).all()
     assert max(wide) > 0
+
+
+def test_an_interval_holds_a_further_draw_with_its_probability():
+    """Between the order statistics at p (N + 1) of N draws: of 400 the 10.025th and 390.975th."""
+    effect = make_effect("payload", replace(default_arm().facts, gravity=(0.0, 0.0, -1.0)))
+    around, spread = np.array([2.0]), 0.1
+    fit = Fit(
+        values=around,
+        jacobian=np.zeros((10, 1, 3, 1)),
+        residual=np.zeros((10, 1, 3)),
+        nuisance=None,
+        hold=np.zeros((1, 1)),
+        misfit=1.0,
+        prior_variance=np.zeros(1),
+    )
+    known = Fitted(fit, np.eye(1), np.array([[spread**2]]))
+    found = intervals({"payload": effect}, {"payload.tip_sag": effect.tip_sag}, known)
+    sag = next(each for each in found if each.name == "tip_sag_mm")
+    drawn = np.sort(around + spread * np.random.default_rng(0).standard_normal(DRAWS))
+    assert DRAWS == 400
+    assert np.ravel(sag.value) == pytest.approx([2.0])
+    low = drawn[9] + 0.025 * (drawn[10] - drawn[9])
+    high = drawn[389] + 0.975 * (drawn[390] - drawn[389])
+    assert np.ravel(sag.low) == pytest.approx([low], abs=1e-6)
+    assert np.ravel(sag.high) == pytest.approx([high], abs=1e-6)
 
 
 def test_intervals_shrink_with_the_data():

@@ -15,7 +15,9 @@ The values v of a fit err by H^-1 (e_1 + e_2 + e_3), with H the curvature of the
   body;
 - e_3 what holds values near their start where the rows say little: the spread of that prior.
 
-Draws from that covariance go through `Effect.quantities`. With B blocks the first part is widened
+Draws from that covariance go through `Effect.quantities`; their quantiles are at p (N + 1) of N
+draws, between which a further draw lies with the stated probability (Weibull 1939; Hyndman & Fan
+1996, type 6). With B blocks the first part is widened
 from normal to Student's t with B - 1 degrees of freedom. Fits from other starts that end elsewhere
 at about the same misfit take their share of the draws.
 
@@ -201,7 +203,7 @@ def intervals(
     for name, effect in effects.items():
         for quantity in effect.quantities():
             drawn = np.array([row[len(answer)] for row in seen], dtype=np.float64)
-            low, high = np.quantile(drawn, [0.025, 0.975], axis=0).tolist()
+            low, high = np.quantile(drawn, [0.025, 0.975], axis=0, method="weibull").tolist()
             answer.append(
                 Parameter(
                     effect=name,

@@ -1,7 +1,7 @@
 """Fall of the error by `amend` on generators of robots that took no part in the decision's fit.
 
     python -m benchmarks.amended_cases chain=FOLDER elastica=FOLDER [--models FOLDER]
-        [--pairs] [--log FILE]
+        [--pairs] [--improve] [--log FILE]
 
 FOLDER holds the cases of `benchmarks.chain_cases` or `benchmarks.elastica_cases`. The decision in
 force judges the stored evidence of each case (`benchmarks/decision/evidence/judged`); a source that
@@ -13,6 +13,9 @@ by the effect that is named alone, by both of two, by the more probable one of a
 The oracle is the error of the same model on the same robot, schedule and noise with nothing hidden
 (`benchmarks.diagnosis.amend`). Its share compares two falls of the error on the held-out quarter:
 that by `amend`, 0 where it claims none, and that by taking the effect out of the robot.
+
+With `--improve` nothing has to be named: every such case goes through
+`surgisoft improve MODEL --data AFTER --refit never`, which repeats diagnosis and amendment.
 """
 
 import argparse
@@ -34,9 +37,11 @@ from benchmarks.diagnosis.after_table import SHOWS
 from benchmarks.diagnosis.amend import Amended, amended
 from benchmarks.rig_cases import TAKES, Generator, after_protocol
 from surgisoft.diagnosis.decision import fitted_decision
+from surgisoft.diagnosis.improve import NETWORK, improve
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.surrogate.checkpoint import load_model
+from surgisoft.surrogate.model import ArmModel
 
 GENERATORS = {"chain": chain_cases.GENERATOR, "elastica": elastica_cases.GENERATOR}
 """Generators by the first word of the name of their evidence."""
@@ -92,6 +97,13 @@ def to_amend(some: Sequence[Judged], effects: int) -> list[tuple[Labelled, str, 
     return answer
 
 
+def to_improve(some: Sequence[Judged], effects: int) -> list[tuple[Labelled, str, tuple[str, ...]]]:
+    """The same of all cases with so many missing effects, for `improve`: none is named."""
+    cases = [one.case for one in some]
+    known = [c for c in cases if c.label == "known" and not c.left_out and c.size >= 1.0]
+    return [(case, "improve", ()) for case in known if len(case.truth) == effects]
+
+
 def unchanged(generator: Generator, case: Labelled, after: str) -> Recording:
     """The recording of a case with nothing hidden: the same robot, schedule and noise."""
     plan, _, number = Path(case.case).name.rpartition("-")
@@ -104,15 +116,30 @@ def worth_of(
     generator: Generator, folder: Path, models: Path, case: Labelled, named: tuple[str, ...]
 ) -> Amended:
     """Amend the model of a case's robot by the named effects, and compare with the oracle."""
+    model, recording, plain = _opened(generator, folder, models, case)
+    before = load_recordings(robot_folder(folder, case.robot) / "before")
+    return amended(model, recording, plain, named, before)
+
+
+def worth_of_improve(generator: Generator, folder: Path, models: Path, case: Labelled) -> Amended:
+    """Improve the model of a case's robot, and compare with the oracle."""
+    model, recording, plain = _opened(generator, folder, models, case)
+    found = improve(model, [recording], refit="never")
+    fall = found.held_out
+    added = tuple(name for name, _ in found.steps if name != NETWORK)
+    after = fall.after if found.claimed else fall.before
+    return Amended(added, fall.before, after, amended(model, recording, plain, ()).oracle)
+
+
+def _opened(
+    generator: Generator, folder: Path, models: Path, case: Labelled
+) -> tuple[ArmModel, Recording, Recording]:
+    """The model of a case's robot, its recording, and the same with nothing hidden."""
     place = folder / case.case
     after = json.loads((place / "truth.json").read_text())["after"]
-    return amended(
-        load_model(model_folder(folder, case.robot, models)),
-        load_recordings(place / "after")[0],
-        unchanged(generator, case, after),
-        named,
-        load_recordings(robot_folder(folder, case.robot) / "before"),
-    )
+    model = load_model(model_folder(folder, case.robot, models))
+    recording = load_recordings(place / "after")[0]
+    return model, recording, unchanged(generator, case, after)
 
 
 def markdown(some: dict[str, list[Worth]]) -> str:
@@ -176,18 +203,21 @@ def main() -> None:
     parser.add_argument("--models", type=Path, default=Path("runs/benchmark-decision/models"))
     parser.add_argument("--log", type=Path, default=Path("runs/amended-cases.jsonl"))
     parser.add_argument("--pairs", action="store_true", help="cases of two effects")
+    parser.add_argument("--improve", action="store_true", help="`improve` in place of `amend`")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    done, answer = read_log(given.log), {}
+    done, answer = read_log(given.log), dict[str, list[Worth]]()
     given.log.parent.mkdir(parents=True, exist_ok=True)
     for name, _, folder in (each.partition("=") for each in given.cases):
         generator = GENERATORS[name.partition("_")[0]]
         answer[name] = []
-        wanted = to_amend(statements(name), 2 if given.pairs else 1)
+        pick = to_improve if given.improve else to_amend
+        wanted = pick(statements(name), 2 if given.pairs else 1)
         for number, (case, kind, named) in enumerate(wanted):
             one = done.get((name, case.case))
-            if one is None or one.amended.effects != named:
-                result = worth_of(generator, Path(folder), given.models, case, named)
+            if one is None or one.kind != kind or (named and one.amended.effects != named):
+                place = generator, Path(folder), given.models, case
+                result = worth_of_improve(*place) if given.improve else worth_of(*place, named)
                 one = Worth(case.case, case.truth, kind, result)
                 with given.log.open("a") as file:
                     file.write(json.dumps({"source": name} | dataclasses.asdict(one)) + "\n")

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from benchmarks import elastica_cases, rig_cases
-from benchmarks.amended_cases import Worth, markdown, statements, to_amend, unchanged
+from benchmarks.amended_cases import (
+    Worth,
+    markdown,
+    statements,
+    to_amend,
+    to_improve,
+    unchanged,
+)
 from benchmarks.decision.evidence_log import Labelled
 from benchmarks.decision.table import Judged
 from benchmarks.diagnosis.amend import Amended
@@ -71,6 +78,9 @@ def test_a_model_is_amended_by_what_is_named():
     ]
     assert [named for _, _, named in to_amend(some, 1)] == [("creep",), ("line_lag",)]
     assert [named for _, _, named in to_amend(some, 2)] == [("line_lag", "creep")]
+    # `improve` takes every case with a visible effect of the list, whatever is said of it.
+    assert [case for case, _, _ in to_improve(some, 1)] == [some[i].case for i in (0, 1, 3, 4)]
+    assert [case for case, _, _ in to_improve(some, 2)] == [some[2].case]
 
 
 def test_shares_of_the_oracle():

@@ -4,11 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-from benchmarks.robust import DEFAULT, LEARNS, Case, Method, Robots
+from benchmarks.robust import DEFAULT, LEARNS, Case, Method, Robots, robust_task
+from benchmarks.robust_estimates import Measured, errors_mm, unfiltered
 from benchmarks.robust_parts import parts
 from surgisoft.agents.on_rig import RigConfig, on_rig
 from surgisoft.rig import VirtualRig
+from surgisoft.surrogate.reach import steady_key_points
+from surgisoft.tasks.laser_work import LASER
 from surgisoft.tasks.registry import make_task
 from surgisoft.tasks.world.random_streams import streams
 
@@ -50,3 +54,21 @@ def test_the_parts_of_an_error_are_those_of_a_known_one():
     assert found.control_slow_mm == pytest.approx(4.0, abs=0.01)
     assert found.control_quick_mm == pytest.approx(1.0, abs=0.01)
     assert found.true_mm == pytest.approx(26.0**0.5)
+
+
+def test_the_error_of_an_estimate_is_that_of_its_beam():
+    """Estimates that are shifted by 0.3 mm across the beam, of recordings of two lengths."""
+    task, every = robust_task(None, 3), []
+    arm = task.world.arms[LASER]
+    pose = arm.pose
+    for steps, shift_mm in ((40, 0.3), (30, 0.0)):
+        at = np.random.default_rng(steps).uniform(0.0, 40.0, (steps, 3))
+        body = torch.tensor(steady_key_points(arm.model, at), dtype=torch.float32)
+        true = body @ pose[:3, :3].mT + pose[:3, 3]
+        axis = arm.backbone.tip_direction(true)
+        across = torch.linalg.cross(axis, torch.tensor([0.0, 0.0, 1.0]).expand_as(axis))
+        off = shift_mm * torch.nn.functional.normalize(across, dim=1)[:, None].expand_as(true)
+        target = true[:, -1] + 50.0 * axis
+        row = (off @ pose[:3, :3], torch.tensor(at), body, pose, true[10:], target[10:])
+        every.append(Measured(*row))
+    np.testing.assert_allclose(errors_mm(task, every, unfiltered), [0.3, 0.0], atol=1e-4)

@@ -50,6 +50,18 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: -work[item.nodeid.partition("::")[0]])
 
 
+@pytest.fixture(scope="module", autouse=True)
+def callables_of_a_file():
+    """Models that the tests of a file name are forgotten after it: hints at the next command name
+    the code that a process was given."""
+    from surgisoft.surrogate.callables.named import NAMED
+
+    before = dict(NAMED)
+    yield
+    NAMED.clear()
+    NAMED.update(before)
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item):
     before = _processor_s()

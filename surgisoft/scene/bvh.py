@@ -103,14 +103,24 @@ def point_triangle(p, a, b, c):
     return dot3(x, y, z, x, y, z), v, w
 
 
+PARALLEL = 1e-14
+"""Least volume that a direction and two edges of a face span, as a share of the product of their
+largest coordinates: below it lies rounding (up to a dozen times 2^-53), and the line is parallel to
+the face, or the face has no area."""
+
+
 @compiled
 def line_triangle(p, d, a, b, c):
-    """Parameter t where p + t d meets triangle a b c, inf for a miss (Moeller & Trumbore 1997)."""
+    """Parameter t where p + t d meets triangle a b c, inf for a miss (Moeller & Trumbore 1997).
+
+    A line that is parallel to the face misses it.
+    """
     e1x, e1y, e1z = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     e2x, e2y, e2z = c[0] - a[0], c[1] - a[1], c[2] - a[2]
     px, py, pz = d[1] * e2z - d[2] * e2y, d[2] * e2x - d[0] * e2z, d[0] * e2y - d[1] * e2x
     det = dot3(e1x, e1y, e1z, px, py, pz)
-    if det == 0.0:
+    size = max(abs(e1x), abs(e1y), abs(e1z)) * max(abs(e2x), abs(e2y), abs(e2z))
+    if abs(det) <= PARALLEL * size * max(abs(d[0]), abs(d[1]), abs(d[2])):
         return math.inf
     sx, sy, sz = p[0] - a[0], p[1] - a[1], p[2] - a[2]
     u = dot3(sx, sy, sz, px, py, pz) / det

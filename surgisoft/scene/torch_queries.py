@@ -14,7 +14,7 @@ import math
 import numpy as np
 import torch
 
-from surgisoft.scene.bvh import TriangleTree
+from surgisoft.scene.bvh import PARALLEL, TriangleTree
 from surgisoft.scene.capsules import arc_lengths, ray_chain, segment_distance
 from surgisoft.scene.field import DistanceField
 from surgisoft.scene.frames import cross, dot, norm
@@ -159,12 +159,14 @@ def line_triangle(p: torch.Tensor, d: torch.Tensor, corners: torch.Tensor) -> to
     e1, e2, s = b - a, c - a, p - a
     h = cross(d, e2)
     det = dot(e1, h)
-    inverse = 1.0 / torch.where(det == 0.0, 1.0, det)
+    size = e1.abs().amax(1) * e2.abs().amax(1) * d.abs().amax(1)
+    parallel = det.abs() <= PARALLEL * size
+    inverse = 1.0 / torch.where(parallel, 1.0, det)
     u = dot(s, h) * inverse
     k = cross(s, e1)
     v = dot(d, k) * inverse
     slack = 1e-12
-    hit = (det != 0.0) & (u >= -slack) & (v >= -slack) & (u + v <= 1.0 + slack)
+    hit = ~parallel & (u >= -slack) & (v >= -slack) & (u + v <= 1.0 + slack)
     return torch.where(hit, dot(e2, k) * inverse, math.inf)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from surgisoft.errors import InputError
@@ -190,9 +190,11 @@ def test_arms_against_each_other_and_themselves():
 
 
 @given(st.lists(point, min_size=5, max_size=5))
+@example([(0, 7e-15, 0), (-7, 1, 0), (0, 7e-15, -7), (-7, 1, -1), (-7, 1, -1)])  # no area
+@example([(0, 0, 0.1), (3, 3, 0.1), (0, 0, 0), (1, 1, 0), (3, 3, 0)])  # no area, parallel
 @settings(max_examples=100, deadline=None)
 def test_segment_to_triangle_is_the_least_over_dense_samples(points):
-    p, q, a, b, c = (np.array(x) for x in points)
+    p, q, a, b, c = (np.array(x, float) for x in points)
     exact = math.sqrt(segment_triangle_d2(tuple(p), tuple(q), tuple(a), tuple(b), tuple(c), 1e9))
     samples = np.linspace(p, q, 2001)
     nearest = trimesh.triangles.closest_point(np.tile([a, b, c], (len(samples), 1, 1)), samples)

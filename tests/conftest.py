@@ -51,15 +51,17 @@ def pytest_collection_modifyitems(items):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def callables_of_a_file():
-    """Models that the tests of a file name are forgotten after it: hints at the next command name
-    the code that a process was given."""
-    from surgisoft.surrogate.callables.named import NAMED
+def code_of_a_file():
+    """Models and effects that the tests of a file name are forgotten after it: hints at the next
+    command name the code that a process was given."""
+    from surgisoft.surrogate.callables import named
+    from surgisoft.surrogate.effects import user_defined
 
-    before = dict(NAMED)
+    known = [(each, dict(each)) for each in (named.NAMED, user_defined.FILES)]
     yield
-    NAMED.clear()
-    NAMED.update(before)
+    for each, before in known:
+        each.clear()
+        each.update(before)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -48,7 +48,7 @@ GENERATORS = {"chain": chain_cases.GENERATOR, "elastica": elastica_cases.GENERAT
 
 
 @dataclass(frozen=True)
-class Worth:
+class AmendedCase:
     """What an amendment by the named effects was worth."""
 
     case: str
@@ -142,7 +142,7 @@ def _opened(
     return model, recording, unchanged(generator, case, after)
 
 
-def markdown(some: dict[str, list[Worth]]) -> str:
+def markdown(some: dict[str, list[AmendedCase]]) -> str:
     """The tables: shares of each source, and each case."""
     lines = [
         "| source | cases | share of the oracle's fall, median | pooled | amended by what is "
@@ -172,7 +172,7 @@ def markdown(some: dict[str, list[Worth]]) -> str:
     return "\n".join(lines)
 
 
-def _shares(some: Sequence[Worth]) -> str:
+def _shares(some: Sequence[AmendedCase]) -> str:
     if not some:
         return "- | -"
     falls = np.array([[w.amended.before - w.amended.after for w in some], _best(some)])
@@ -180,18 +180,18 @@ def _shares(some: Sequence[Worth]) -> str:
     return f"{100 * middle:.0f} % | {100 * falls[0].sum() / falls[1].sum():.0f} %"
 
 
-def _best(some: Sequence[Worth]) -> list[float]:
+def _best(some: Sequence[AmendedCase]) -> list[float]:
     return [w.amended.before - w.amended.oracle for w in some]
 
 
-def read_log(log: Path) -> dict[tuple[str, str], Worth]:
+def read_log(log: Path) -> dict[tuple[str, str], AmendedCase]:
     """Stored results by source and case."""
     found = {}
     for line in log.read_text().splitlines() if log.is_file() else []:
         values = json.loads(line)
         about = values["amended"]
         a = Amended(**about | {"effects": tuple(about["effects"])})
-        one = Worth(values["case"], tuple(values["truth"]), values["kind"], a)
+        one = AmendedCase(values["case"], tuple(values["truth"]), values["kind"], a)
         found[values["source"], one.case] = one
     return found
 
@@ -206,7 +206,7 @@ def main() -> None:
     parser.add_argument("--improve", action="store_true", help="`improve` in place of `amend`")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    done, answer = read_log(given.log), dict[str, list[Worth]]()
+    done, answer = read_log(given.log), dict[str, list[AmendedCase]]()
     given.log.parent.mkdir(parents=True, exist_ok=True)
     for name, _, folder in (each.partition("=") for each in given.cases):
         generator = GENERATORS[name.partition("_")[0]]
@@ -218,7 +218,7 @@ def main() -> None:
             if one is None or one.kind != kind or (named and one.amended.effects != named):
                 place = generator, Path(folder), given.models, case
                 result = worth_of_improve(*place) if given.improve else worth_of(*place, named)
-                one = Worth(case.case, case.truth, kind, result)
+                one = AmendedCase(case.case, case.truth, kind, result)
                 with given.log.open("a") as file:
                     file.write(json.dumps({"source": name} | dataclasses.asdict(one)) + "\n")
             answer[name].append(one)

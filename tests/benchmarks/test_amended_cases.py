@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks import elastica_cases, rig_cases
 from benchmarks.amended_cases import (
-    Worth,
+    AmendedCase,
     markdown,
     statements,
     to_amend,
@@ -87,9 +87,9 @@ def test_shares_of_the_oracle():
     """By hand: falls of 0.9 of 1.0 and of 1.5 of 3.0 mm; where the effect does not show in the
     held-out rows no share is counted."""
     worth = [
-        Worth("a", ("creep",), "identified", Amended(("creep",), 2.0, 1.1, 1.0)),
-        Worth("b", ("creep",), "identified", Amended(("line_lag",), 4.0, 2.5, 1.0)),
-        Worth("c", ("creep",), "identified", Amended(("creep",), 1.05, 1.0, 1.0)),
+        AmendedCase("a", ("creep",), "identified", Amended(("creep",), 2.0, 1.1, 1.0)),
+        AmendedCase("b", ("creep",), "identified", Amended(("line_lag",), 4.0, 2.5, 1.0)),
+        AmendedCase("c", ("creep",), "identified", Amended(("creep",), 1.05, 1.0, 1.0)),
     ]
     rows = markdown({"chain": worth}).splitlines()
     assert rows[2] == "| chain | 2 | 70 % | 60 % | 1 | 90 % | 90 % |"

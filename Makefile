@@ -6,6 +6,9 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DOCS_STAMP := $(VENV)/.installed-docs
 
+# Without bytecode each process that a test starts, and each of pytest's workers, compiles all modules.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test fast coverage lint docs fuzz mutants kills sbom tutorials clean
 
 $(STAMP): pyproject.toml constraints.txt

@@ -6,9 +6,12 @@ first, so that the last ones are short and no process waits for another at the e
 `slow.txt` lists the tests that take at least SLOW_S of processor time; `pytest -m fast` runs the
 others. The list is written by
 
-    OMP_NUM_THREADS=1 python -m pytest -n 0 -q --write-slow
+    python -m pytest -n 0 -q --write-slow
 
-which measures every test, with its fixtures and the processes that it starts.
+which measures each test that it runs, with its fixtures and the processes that it starts. A
+fixture that is made once for several tests counts for each of them, as any one may be the only one
+that is run. The times of tests that are not run stay as they are, so that a single file can be
+measured.
 """
 
 import os
@@ -25,26 +28,29 @@ settings.register_profile(
 )
 settings.load_profile("surgisoft")
 
-SLOW_S = 0.5
+SLOW_S = 0.4
 """Processor time of a test, with its fixtures, from which it is slow, s."""
 SLOW = Path(__file__).with_name("slow.txt")
 """The slow tests: `path::function` and the time of the slowest of its cases, s."""
 
 _TIMES: dict[str, float] = defaultdict(float)
+"""Longest time of each test that has run, s."""
+_SHARED: dict[tuple[str, str], float] = {}
+"""Time to make each fixture of a class, file, folder or session, s, by its place and name."""
 
 
 def pytest_addoption(parser):
     parser.addoption(
-        "--write-slow", action="store_true", help=f"measure all tests and write {SLOW.name} anew"
+        "--write-slow", action="store_true", help=f"measure the tests and write them to {SLOW.name}"
     )
 
 
 def pytest_collection_modifyitems(items):
     """Mark each test `slow` or `fast`; put the files with the most processor time first."""
-    slow = dict(line.split() for line in SLOW.read_text().splitlines())
+    slow = _slow()
     work: dict[str, float] = defaultdict(float)
     for name, time in slow.items():
-        work[name.partition("::")[0]] += float(time)
+        work[name.partition("::")[0]] += time
     for item in items:
         item.add_marker(pytest.mark.slow if _function(item) in slow else pytest.mark.fast)
     items.sort(key=lambda item: -work[item.nodeid.partition("::")[0]])
@@ -65,19 +71,39 @@ def code_of_a_file():
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_protocol(item):
+def pytest_fixture_setup(fixturedef):
     before = _processor_s()
     try:
         return (yield)
     finally:
-        name = _function(item)
-        _TIMES[name] = max(_TIMES[name], _processor_s() - before)
+        if fixturedef.scope != "function":
+            _SHARED[fixturedef.baseid, fixturedef.argname] = _processor_s() - before
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item):
+    before, known = _processor_s(), dict(_SHARED)
+    try:
+        return (yield)
+    finally:
+        spent = _processor_s() - before
+        for (place, name), time in _SHARED.items():
+            if name in item.fixturenames and item.nodeid.startswith(place):
+                spent += time if (place, name) in known else 0.0
+        _TIMES[_function(item)] = max(_TIMES[_function(item)], spent)
 
 
 def pytest_sessionfinish(session):
     if session.config.getoption("--write-slow"):
-        slow = {name: time for name, time in _TIMES.items() if time >= SLOW_S}
-        SLOW.write_text("".join(f"{name} {slow[name]:.1f}\n" for name in sorted(slow)))
+        times = {**_slow(), **_TIMES}
+        lines = (f"{name} {times[name]:.1f}\n" for name in sorted(times) if times[name] >= SLOW_S)
+        SLOW.write_text("".join(lines))
+
+
+def _slow() -> dict[str, float]:
+    """The list: processor time by test, s."""
+    lines = (line.split() for line in SLOW.read_text().splitlines())
+    return {name: float(time) for name, time in lines}
 
 
 def _function(item) -> str:

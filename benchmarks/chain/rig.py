@@ -64,30 +64,47 @@ class ChainRig:
             begin = self._state.time[0]
             plants.run(self._plant, self._state, 1e3 * commands, self.period_s, steps, *out, room)
             parts.append((begin + self.period_s * np.arange(1, count + 1), commands, *out, room))
-        t_s, commanded, measured, chambers, points, room = (
-            np.concatenate(column) for column in zip(*parts, strict=True)
-        )
-        clean = 1e3 * points
-        if not np.isfinite(clean).all():
-            raise InputError("the chain became unstable: use a weaker effect")
-        seen = clean + self._noise * camera_noise(
-            self._cameras, len(t_s), self.key_planes, self._rng
-        )
-        error = seen - clean
-        if self._noise > 0.0:
-            drop_frames(self._cameras, seen, self._rng)
-        draw = self._rng.standard_normal(measured.shape)
-        recording = describe(
-            self,  # type: ignore[arg-type]  # it records, and is not read
-            protocol,
-            t_s - t_s[0],
-            1e-3 * (measured + self._noise * SENSOR_NOISE * self._plant.high * draw),
-            seen,
-            commanded,
-            noise_mm=float(np.sqrt(np.mean(np.square(error)))),
-            temp_C=room + self._noise * THERMOMETER_K * self._rng.standard_normal(len(room)),
-        )
-        return recording, Truth(clean, clean, 1e-3 * chambers)
+        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        high = self._plant.high
+        return as_measured(self, protocol, columns, self._cameras, high, self._noise, self._rng)
+
+
+def as_measured(
+    rig,
+    protocol: Protocol,
+    columns: Sequence[np.ndarray],
+    cameras: Cameras,
+    high: float,
+    noise: float,
+    rng: np.random.Generator,
+) -> tuple[Recording, Truth]:
+    """What sensors and cameras make of T samples of a robot on its bench, and their true state.
+
+    columns: times (T,) [s], commands (T, m) [kPa], pressures at the sensors and in the chambers,
+    each (T, m) [Pa], key points (T, n, 3) [m] and the room's temperatures (T,) [degrees Celsius];
+    high: upper limit of pressure [Pa]; noise: factor on all noise.
+    Raises InputError for key points that are not finite.
+    """
+    t_s, commanded, measured, chambers, points, room = columns
+    clean = 1e3 * points
+    if not np.isfinite(clean).all():
+        raise InputError("the arm became unstable: use a weaker effect")
+    seen = clean + noise * camera_noise(cameras, len(t_s), rig.key_planes, rng)
+    error = seen - clean
+    if noise > 0.0:
+        drop_frames(cameras, seen, rng)
+    draw = rng.standard_normal(measured.shape)
+    recording = describe(
+        rig,  # it records, and is not read
+        protocol,
+        t_s - t_s[0],
+        1e-3 * (measured + noise * SENSOR_NOISE * high * draw),
+        seen,
+        commanded,
+        noise_mm=float(np.sqrt(np.mean(np.square(error)))),
+        temp_C=room + noise * THERMOMETER_K * rng.standard_normal(len(room)),
+    )
+    return recording, Truth(clean, clean, 1e-3 * chambers)
 
 
 def camera_noise(

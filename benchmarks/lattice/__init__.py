@@ -1,0 +1,1 @@
+"""A fourth generator of robots: a lattice of springs around pressurised chambers."""

@@ -132,7 +132,7 @@ def test_constant_curvature_recovers_a_constant_curvature_arm():
 
 def test_recurrent_baseline_learns(walks):
     train, valid, test = walks
-    result = fit(train, valid, SPEC, FitConfig(network="recurrent", epochs=50))
+    result = fit(train, valid, SPEC, FitConfig(network="recurrent", epochs=30))
     assert rmse(result.model, test) < 0.1 * spread(test)
 
 
@@ -303,7 +303,7 @@ def test_auto_tries_the_effects_that_ask_for_it(monkeypatch):
         (timed, {"hysteresis"} | of_time),
         (replace(timed, t_s=torch.zeros_like(timed.t_s)), {"hysteresis"}),
     ):
-        result = fit(recorded, None, SPEC, replace(SMALL, effects=("auto",), epochs=10))
+        result = fit(recorded, None, SPEC, replace(SMALL, effects=("auto",), epochs=3))
         found = {name for stage in result.stages for name in stage.tried_mm or {}}
         for warning in result.warnings:
             if warning.startswith("no effect with memory added"):

@@ -1,15 +1,23 @@
 """Import, fit, diagnose and amend on real robots, against what their makers say of them."""
 
 import json
+from functools import partial
 
 from surgisoft.cli import diagnose, run
+from surgisoft.diagnosis import diagnose as diagnosing
+from surgisoft.diagnosis.refit import RefitConfig
+from surgisoft.diagnosis.refit import refit as fitted_together
 
 SMALL = ["--widths", "32,32", "--inputs", "pressure", "--epochs", "30"]
+BRIEF = RefitConfig(rows=2000, seeds=2, first_epochs=4, epochs=15, finalists=2)
+"""The budget of a refit: about a sixth of that of the commands."""
 
 
 def diagnosis(monkeypatch, recording, tmp_path, *options, of=None, refit="auto"):
     """A small model of a recording, and what is missing in it on the same or another one."""
     monkeypatch.setattr(diagnose, "REFIT_PROCESSES", 1)  # two give the same: test_refit.py
+    brief = partial(fitted_together, config=BRIEF)
+    monkeypatch.setattr(diagnosing, "fit_candidates_together", brief)
     model, out = tmp_path / "-".join(["arm", *options]), tmp_path / "found.json"
     assert run(["fit", str(recording), "-o", str(model), *SMALL, *options]) == 0
     asked = ["diagnose", str(model), str(of or recording), "--refit", refit, "--json", str(out)]

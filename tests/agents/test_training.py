@@ -28,9 +28,16 @@ CPU = torch.device("cpu")
 TINY = Preset(envs=8, rollout=8, epochs=2, batches=2, evaluate_every=2, evaluation_episodes=2)
 
 
+def short(config):
+    """A configuration of a path task whose episodes end after 25 steps, within a training."""
+    return with_fields(config, loop_s=2.0, approach_s=0.5)
+
+
 def plan_of(task="track_circle", turns=4, preset=TINY, **changes):
     steps = turns * preset.envs * preset.rollout
-    return Plan(task, config_of(task), "fast", preset, steps, **changes)
+    config = config_of(task)
+    config = short(config) if task == "track_circle" else config
+    return Plan(task, config, "fast", preset, steps, **changes)
 
 
 def trained(folder, plan):
@@ -152,7 +159,7 @@ def test_every_preset_goes_on_as_if_uninterrupted(name, tmp_path):
     small = {"envs": 4, "rollout": 4, "epochs": 1, "batches": 2, "hidden": (8,)}
     preset = PRESETS.get(name, Preset(normalise=True, last_noise=None))
     preset = replace(preset, **small, evaluate_every=1, evaluation_episodes=1)
-    config = config_for(name, config_of("track_circle"))
+    config = config_for(name, short(config_of("track_circle")))
     whole, cut = tmp_path / "whole", tmp_path / "cut"
 
     def cut_after_one(progress):

@@ -4,6 +4,7 @@ The libraries are imported once, in this process. The test that noticed a mutant
 the first to run.
 """
 
+import gc
 import importlib.util
 import os
 import resource
@@ -34,12 +35,10 @@ OURS = ("benchmarks", "surgisoft", "tests")
 def prepare(tree: Path) -> None:
     """Import the libraries, and set what processes that are forked or started later inherit.
 
-    They import the packages of the project from the tree and write no bytecode: a file that is
-    changed twice within a second could have that of the change before.
+    They import the packages of the project from the tree.
     """
     os.environ |= {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
-    os.environ |= {"SURGISOFT_SHARED": "/nonexistent", "PYTHONDONTWRITEBYTECODE": "1"}
-    sys.dont_write_bytecode = True
+    os.environ["SURGISOFT_SHARED"] = "/nonexistent"
     for name in LIBRARIES:
         if importlib.util.find_spec(name.split(".")[0]):
             importlib.import_module(name)
@@ -121,9 +120,16 @@ def run_tests(tree: Path, arguments: Sequence[str]) -> tuple[int, list[str]]:
 
 
 def _pytest(tree: Path, arguments: Sequence[str]) -> None:
-    """Run pytest in this process on the packages of a tree, and end the process."""
+    """Run pytest in this process on the packages of a tree, and end the process.
+
+    Neither it nor a process that it starts writes bytecode: a file that is changed twice within a
+    second could have that of the change before.
+    """
     import pytest
 
+    os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
+    sys.dont_write_bytecode = True
+    gc.freeze()  # else each collection goes through, and copies, all that the first process holds
     for name in [name for name in sys.modules if name.split(".")[0] in OURS]:
         del sys.modules[name]
     sys.modules["__main__"] = types.ModuleType("__main__")  # processes that tests start import it

@@ -70,13 +70,13 @@ def played(episodes, count, steps, seed=0):
 def test_a_batch_of_n_is_n_batches_of_one(name):
     """To rounding: matrix products of other sizes add up in another order; a beam has a lever."""
     episodes = Episodes(task_of(name))
-    together = episodes.seeded(3, 4)
-    alone = [episodes.seeded(3, 1, first=i) for i in range(4)]
-    for step in range(30):
-        actions = random_actions(episodes.task, 4, step)
+    together = episodes.seeded(3, 3)
+    alone = [episodes.seeded(3, 1, first=i) for i in range(3)]
+    for step in range(20):
+        actions = random_actions(episodes.task, 3, step)
         together, outcome = episodes.step(together, actions)
         seen = episodes.observe(together)
-        for i in range(4):
+        for i in range(3):
             own = {agent: value[i : i + 1] for agent, value in actions.items()}
             alone[i], one = episodes.step(alone[i], own)
             for agent in episodes.task.agents:
@@ -97,7 +97,7 @@ def test_the_same_seed_gives_the_same_episode_to_the_last_step(name):
     for one, other in zip(seen, seen_again, strict=True):
         for agent in episodes.task.agents:
             assert torch.equal(one[agent], other[agent])
-    assert not torch.equal(total, played(episodes, 3, steps, seed=9)[1])
+    assert not torch.equal(played(episodes, 3, 1)[1], played(episodes, 3, 1, seed=9)[1])
 
 
 @every_task
@@ -417,24 +417,29 @@ def reward_terms(name, config=None):
 
 @every_task
 def test_a_weight_scales_its_reward_term_and_no_other(name):
-    """Each weight trebled in turn; 0 leaves the term out."""
+    """The first term of each agent, by factors that differ between agents; 0 leaves it out."""
     usual, own = reward_terms(name), to_table(config_of(name))
     tables = {"follow": own["follow"]} if "follow" in own else {"": own}
     ((part, table),) = tables.items()
-    for agent, terms in usual.items():
-        weights = table["weights"].get(agent, table["weights"])
-        term = next(iter(terms))
-        for factor in (3.0, 0.0) if len(terms) > 1 else (3.0,):
-            change = {term: factor * weights[term]}
-            change = {agent: change} if agent in table["weights"] else change
-            change = {"weights": change}
-            config = config_from(name, {part: change} if part else change, Path("x.toml"))
-            changed = reward_terms(name, config)[agent]
-            assert (term in changed) == (factor != 0.0)
-            for other, value in changed.items():
-                torch.testing.assert_close(
-                    value, terms[other] * (factor if other == term else 1.0), rtol=1e-6, atol=1e-6
-                )
+    first = {agent: next(iter(terms)) for agent, terms in usual.items()}
+    trebled = {agent: 3.0 + number for number, agent in enumerate(usual)}
+    absent = {agent: 0.0 if len(terms) > 1 else 2.0 for agent, terms in usual.items()}
+    for factors in (trebled, absent) if 0.0 in absent.values() else (trebled,):
+        weights = {}
+        for agent, term in first.items():
+            own_weights = table["weights"].get(agent, table["weights"])
+            change = {term: factors[agent] * own_weights[term]}
+            weights |= {agent: change} if agent in table["weights"] else change
+        change = {"weights": weights}
+        config = config_from(name, {part: change} if part else change, Path("x.toml"))
+        changed = reward_terms(name, config)
+        assert changed.keys() == usual.keys()
+        for agent, terms in usual.items():
+            left_out = {first[agent]} if factors[agent] == 0.0 else set()
+            assert changed[agent].keys() == terms.keys() - left_out
+            for other, value in changed[agent].items():
+                factor = factors[agent] if other == first[agent] else 1.0
+                torch.testing.assert_close(value, terms[other] * factor, rtol=1e-6, atol=1e-6)
 
 
 def test_rewards_of_the_keyhole_by_hand():

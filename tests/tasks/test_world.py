@@ -329,7 +329,8 @@ def test_an_arm_in_degrees_follows_a_path(tripod, tmp_path):
     """Its 90 degrees stand for 70 kPa. The circle is level with the straight arm, above the tips
     that an arc of constant length reaches: the expert holds the tip at the nearest of them."""
     save_model(tripod("deg", 90.0), tmp_path / "arm")
-    task = make_task("track_circle", TrackConfig(FollowConfig(arm=str(tmp_path / "arm"))))
+    config = TrackConfig(FollowConfig(arm=str(tmp_path / "arm"), loop_s=5.0))
+    task = make_task("track_circle", config)
     assert task.world.arms["arm"].high.tolist() == pytest.approx([70.0] * 3)
     found = rollout(task, Scripted(), 1, 0)
     bend = np.linspace(0.01, 0.6, 10_000)

@@ -43,7 +43,7 @@ from benchmarks.lattice.body import ALONG, LEFT, RIB, RIGHT
 from benchmarks.lattice.gas import VOLUMES
 from benchmarks.lattice.motion import new_state, settle
 from benchmarks.lattice.plant import Plant
-from benchmarks.lattice.robot import STREAM
+from benchmarks.lattice.robot import SLABS, STREAM
 from surgisoft.rig.hidden import Hidden, random_direction, switch_on_from
 
 EVENT_WINDOW_S = (20.0, 130.0)
@@ -92,11 +92,11 @@ def _last_wall_node(plant: Plant, rng: np.random.Generator) -> int:
     return len(plant.body.nodes) - 1 - int(rng.integers(2 * len(plant.body.faces)))
 
 
-def _shapes(plant: Plant) -> np.ndarray:
-    """(1 + m, N, 3) nodes [m] at rest: vented, and with each chamber at its limit alone."""
+def _shapes(plant: Plant, rng: np.random.Generator) -> np.ndarray:
+    """(12, N, 3) nodes [m] at rest under random pressures in all chambers."""
     alone = plant._replace(ball=np.zeros(5), cable=np.zeros(6), guide=np.zeros(7))
     shapes = []
-    for pressures in np.vstack([np.zeros(len(plant.chambers)), np.eye(len(plant.chambers))]):
+    for pressures in rng.random((12, len(plant.chambers))):
         state = new_state(alone)
         state.air[VOLUMES] = plant.high * pressures
         settle(alone, state)
@@ -153,20 +153,20 @@ def _rate_dependence(setup: Setup, strength: float, rng: np.random.Generator) ->
 
 
 def _contact(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    """A ball on the side to which one chamber bends the arm, at its upper half.
+    """A ball beside the upper half of the arm, on a side to which random pressures bend it.
 
-    At strength 1 it is touched at 45 % of the way that the arm goes there; a weaker one is farther
-    away and softer.
+    At strength 1 it is touched at two of five random pressures; a weaker one is farther away and
+    softer.
     """
     plant, section = setup.plant, _section(setup.plant)
-    layer = int(rng.integers(plant.keys[-1] // 2, plant.keys[-1]))
-    shapes = _shapes(plant)[:, layer * section]
-    chamber = int(np.argmax(np.linalg.norm(shapes[1:] - shapes[0], axis=1) * rng.uniform(0.5, 1.0)))
-    way = shapes[1 + chamber] - shapes[0]
-    far = float(np.linalg.norm(way))
+    layer = int(rng.integers(SLABS // 2 + 1, SLABS))
+    axis = _shapes(plant, rng)[:, layer * section]
+    middle = axis.mean(axis=0)
+    way = axis[int(rng.integers(len(axis)))] - middle
+    way /= np.linalg.norm(way)
     radius = rng.uniform(1.0, 2.5) * _radius(plant)
-    touched = shapes[0] + (0.3 + 0.4 * math.exp(-strength)) * way
-    centre = touched + (radius + _radius(plant)) * way / far
+    touched = float(np.quantile((axis - middle) @ way, 0.35 + 0.5 * math.exp(-0.7 * strength)))
+    centre = middle + (touched + radius + _radius(plant)) * way
     # As stiff as the arm several times, shared by the nodes of a few cross-sections.
     stiffness = min(4.0 * strength, 10.0) / _compliance(plant)
     _set(setup, ball=np.array([*centre, radius, stiffness]))
@@ -250,13 +250,12 @@ def _leak(setup: Setup, strength: float, rng: np.random.Generator) -> None:
 
 
 def _cable(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    """A cable along the wall that is taut beyond 40 % of the way on which it is stretched most."""
-    plant, shapes = setup.plant, _shapes(setup.plant)
+    """A cable along the wall that is taut at every other of random pressures."""
+    plant, shapes = setup.plant, _shapes(setup.plant, rng)
     node = _last_wall_node(plant, rng)
     anchor = 1.3 * plant.body.nodes[node] * np.array([1.0, 1.0, 0.0])
-    lengths = np.linalg.norm(shapes[:, node] - anchor, axis=1)
-    free = lengths[0] + 0.4 * (lengths.max() - lengths[0])
-    rigidity = 0.5 * strength * (_length(plant) / _radius(plant)) ** 2 / _compliance(plant) * free
+    free = float(np.median(np.linalg.norm(shapes[:, node] - anchor, axis=1)))
+    rigidity = 0.05 * strength * (_length(plant) / _radius(plant)) ** 2 / _compliance(plant) * free
     _set(setup, cable=np.array([*anchor, node, free, rigidity]))
 
 

@@ -4,6 +4,7 @@ An effect that cannot show is no candidate: ranked, it could only fit noise. A d
 with the reason.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -37,6 +38,10 @@ REASONS = {
 DETECTED = 3.0
 """Change, in standard errors of the mean noise of independent blocks, from which an effect stands
 out from the noise."""
+LARGER = tuple(2.0**power for power in range(11))
+"""Multiples of the least amplitude that stands out at which plausibility is asked. The least one
+may be below the plausible range, as a support that yields more than any real one; with a factor of
+two between them no plausible range is skipped."""
 
 
 @dataclass(frozen=True)
@@ -124,8 +129,8 @@ def _stands_out(problem: Problem, candidate: Candidate) -> bool:
     best = int(np.argmax(columns))
     least = DETECTED * problem.floor_mm / np.sqrt(max(len(problem.motion), 1))
     amplitudes = np.zeros(len(columns))
-    for sign in (1.0, -1.0):
-        amplitudes[best] = sign * least / np.sqrt(columns[best])
+    for factor, sign in itertools.product(LARGER, (1.0, -1.0)):
+        amplitudes[best] = sign * factor * least / np.sqrt(columns[best])
         effect = candidate.with_amplitudes(amplitudes)
         if effect is None or all(quantity.plausible for quantity in effect.quantities()):
             return True

@@ -8,12 +8,16 @@ import numpy as np
 import pytest
 
 from surgisoft.cli import run
+from surgisoft.diagnosis.candidates import candidates
 from surgisoft.diagnosis.diagnose import amplitudes_that_vary, diagnose, knock, would_explain
+from surgisoft.diagnosis.inputs import identification_problem
 from surgisoft.diagnosis.residuals import Floor, held_out_rows, residual_table
+from surgisoft.diagnosis.testability import DETECTED, testable
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, load_model, load_training_residuals
+from surgisoft.surrogate.effects.contact import LEAST_SHARE
 
 
 def recorded(hidden=(), take=3, points=6000):
@@ -246,6 +250,27 @@ def test_steady_state_samples_rank_no_rates(tmp_path, capsys):
     save_recording(settled, tmp_path / "x.parquet")
     assert run(["diagnose", "default", str(tmp_path / "x.parquet")]) == 0
     assert "not testable: line_lag" in capsys.readouterr().out
+
+
+def test_an_effect_that_shows_below_its_plausible_range_is_a_candidate():
+    """A share of a support that yields more than any real one stands out: larger ones do too."""
+    rig = VirtualRig(0, take=7, noise=0.1)
+    recording = rig.record(make_protocol("mixed", rig.limits, 600, seed=2))[0]
+    problem = identification_problem(default_arm(), [recording])
+    least_mm = DETECTED * problem.floor_mm / np.sqrt(len(problem.motion))
+
+    def share(support):
+        """The least share that stands out."""
+        return least_mm / np.sqrt(np.square(support.sensitivities).sum(2).mean((0, 1)).max())
+
+    some = [each for each in candidates(problem, ["contact"]) if share(each) < LEAST_SHARE]
+    assert some
+    assert testable(problem, some, ["contact"]) == (some, ())
+    # With much more noise no support of any share would be seen.
+    table = replace(problem.table, noise_mm=1e4 * problem.noise_mm)
+    kept, absent = testable(replace(problem, table=table), some, ["contact"])
+    assert not kept
+    assert [each.cause for each in absent] == ["below_noise"]
 
 
 def test_all_shares_of_a_diagnosis_are_between_0_and_1(found):

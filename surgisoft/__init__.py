@@ -8,6 +8,7 @@ System identification of an arm:
     load_model, save_model       a model's folder <-> `ArmModel`
     load_recording(s), save_recording
     collect                      a recording from a rig, by default the virtual one
+    import_recordings            a laboratory's files -> recordings
     fit                          recordings -> model (grey-box: network and physical effects)
     compare                      a model's error, and what the error depends on
     diagnose                     the physical effect that a model lacks
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
     from surgisoft.diagnosis.improve import improve
     from surgisoft.live.session import run
     from surgisoft.measurement.fitting import fit
+    from surgisoft.measurement.importing import import_recordings
     from surgisoft.measurement.recordings import (
         load_recording,
         load_recordings,
@@ -68,6 +70,7 @@ _PLACES = {
     "diagnose": "diagnosis.diagnose",
     "evaluate": "agents.session",
     "fit": "measurement.fitting",
+    "import_recordings": "measurement.importing",
     "improve": "diagnosis.improve",
     "load_model": "surrogate.checkpoint",
     "load_recording": "measurement.recordings",
@@ -97,6 +100,7 @@ __all__ = [
     "diagnose",
     "evaluate",
     "fit",
+    "import_recordings",
     "improve",
     "load",
     "load_model",

@@ -55,6 +55,26 @@ class Rules(Protocol):
     """Rules that an experiment lays over a task: its phases, interlock and limits."""
 
     @property
+    def name(self) -> str:
+        """Name of the experiment."""
+        ...
+
+    @property
+    def task(self) -> str:
+        """Name of the task that the rules are for."""
+        ...
+
+    @property
+    def config(self) -> Any:
+        """Configuration of the task, with the scene of the experiment."""
+        ...
+
+    @property
+    def seed(self) -> int:
+        """Seed of the experiment's episodes."""
+        ...
+
+    @property
     def without(self) -> Collection[str]:
         """Measures of single steps whose means mean nothing."""
         ...
@@ -75,11 +95,11 @@ class EvaluationRequest:
     policies: Sequence[str]
     """`scripted`, `random`, or folders of training runs."""
     task: str | None = None
-    """Name of the task; None: that of the first run."""
+    """Name of the task; None: that of the rules, else of the first run."""
     episodes: int = 20
     """Episodes of each policy."""
-    seed: int = 0
-    """Seed of the episodes, equal for each policy."""
+    seed: int | None = None
+    """Seed of the episodes, equal for each policy; None: that of the rules, else 0."""
     rig: RigConfig | None = None
     """The arms are on these rigs; None: in simulation."""
     exact_checks: bool = True
@@ -89,9 +109,11 @@ class EvaluationRequest:
     scene: str | Path | None = None
     """Scene; None: the configuration's."""
     config: Any = None
-    """Configuration of the task, or a TOML file with fields of it; None: that of the first run."""
+    """Configuration of the task, or a TOML file with fields of it; None: that of the rules, else
+    of the first run."""
     rules: Rules | None = None
-    """Rules of an experiment that are laid over the task; None: the task alone."""
+    """Rules of an experiment that are laid over the task, which they name, with its configuration
+    and the seed of the episodes; None: the task alone."""
     log: Collection[str] = ()
     """Policies whose first episode is logged."""
 
@@ -99,6 +121,24 @@ class EvaluationRequest:
     def place(self) -> str:
         """Plant of the episodes: `simulation` or `rig`."""
         return "simulation" if self.rig is None else "rig"
+
+    def under_rules(self) -> EvaluationRequest:
+        """The request with task, configuration and seed of its rules, where it has rules.
+
+        Raises InputError where the rules are those of another task, and for a configuration beside
+        them.
+        """
+        if self.rules is None:
+            return replace(self, seed=self.seed or 0)
+        if self.config is not None:
+            raise InputError("--config and --rules both set the task's fields; give one of the two")
+        if self.task not in (None, self.rules.task):
+            raise InputError(
+                f"--rules {self.rules.name}: is an experiment of {self.rules.task}, not of "
+                f"{self.task}"
+            )
+        seed = self.rules.seed if self.seed is None else self.seed
+        return replace(self, task=self.rules.task, config=self.rules.config, seed=seed)
 
     def resolved(self, on_warning: Callable[[str], None]) -> tuple[Task, Any]:
         """The task and its configuration; a training run determines both."""
@@ -152,7 +192,7 @@ class Evaluations:
     """How well several policies do one task, on the same episodes."""
 
     request: EvaluationRequest
-    """What was asked for."""
+    """What was asked for, with the seed that the episodes have."""
     task: str
     """Name of the task."""
     task_config: dict
@@ -207,12 +247,14 @@ def evaluate(
 
     policies: `scripted` (inverse kinematics with privileged information), `random`, or folders of
     training runs. A run brings its task and the task's configuration.
-    fields: other fields of `EvaluationRequest`, such as `episodes=100` or `rig=RigConfig(seed=3)`.
+    fields: other fields of `EvaluationRequest`, such as `episodes=100` or `rig=RigConfig(seed=3)`;
+    `rules=ExperimentRules.of("liver")` (`surgisoft.experiments.session`) evaluates under the rules
+    of an experiment.
     progress: called with (episodes done, episodes to do, policy).
     """
     given = [policies] if isinstance(policies, str | Path) else policies
     names = tuple(dict.fromkeys(str(name) for name in given))
-    request = EvaluationRequest(names, task, **fields)
+    request = EvaluationRequest(names, task, **fields).under_rules()
     plain, config = request.resolved(on_warning)
     place = plain if request.rig is None else on_rig(plain, request.rig, on_warning=on_warning)
     if request.rules is not None:
@@ -237,15 +279,14 @@ def _evaluated(
     request: EvaluationRequest, plain: Task, place: Task, config: Any, progress: Progress
 ) -> Evaluations:
     """Roll out every policy of a request on a task that is placed in simulation or on rigs."""
-    measured = tuple(real_benches(place))
+    measured, seed = tuple(real_benches(place)), request.seed or 0
     opening = open_policy if request.rules is None else request.rules.policy
     opened = {name: opening(name, place) for name in request.policies}
     if measured:
         for policy in opened.values():
             _warm_up(plain, policy)
     logs = {
-        name: EpisodeRecorders(place, name, request.seed, request.place, only=0)
-        for name in request.log
+        name: EpisodeRecorders(place, name, seed, request.place, only=0) for name in request.log
     }
     results = []
     for number, (name, policy) in enumerate(opened.items()):
@@ -260,7 +301,7 @@ def _evaluated(
             name,
             policy,
             request.episodes,
-            request.seed,
+            seed,
             request.exact_checks,
             batch=1 if measured else BATCH,
             progress=tell,

@@ -9,7 +9,6 @@ from surgisoft.cli import app
 from surgisoft.cli.amended import (
     NOT_CLAIMED,
     claim_other_folder,
-    save_amended,
     show_parameters,
     write_before_and_after,
 )
@@ -90,6 +89,7 @@ def amend(
     claim_other_folder(output, model, force)
 
     from surgisoft.diagnosis.amend import amend as amend_model
+    from surgisoft.surrogate.checkpoint import save_model
     from surgisoft.surrogate.effects import named_effect
 
     # Files of effects first: the model may hold one of them.
@@ -113,7 +113,7 @@ def amend(
     saved = result.claimed or anyway
     written = []
     if saved:
-        save_amended(result, output, model, measured, force)
+        save_model(result.model, output, result.to_json(), force)
     if json_file:
         write_json(json_file, result.to_json())
         written.append(json_file)

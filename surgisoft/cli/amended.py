@@ -20,17 +20,6 @@ def claim_other_folder(output: Path, model: Path, force: bool) -> None:
     claim_folder(output, force)
 
 
-def save_amended(result, output: Path, model: Path, recordings, force: bool) -> None:
-    """Write the new model with a record of how it was made."""
-    from surgisoft.surrogate.checkpoint import save_model
-
-    record = result.to_json() | {
-        "amended_from": model.name,
-        "recordings": [recording.name for recording in recordings],
-    }
-    save_model(result.model, output, record, force)
-
-
 def write_before_and_after(result, tables: dict, name: str, file: Path) -> Path:
     """Write the replay of the old and the new model, by their residuals on the same recordings."""
     from surgisoft.replay.model_error import write_models

@@ -107,8 +107,7 @@ def compare(
         compared = compare_all(
             models,
             measured,
-            [each.name for each in models],
-            tell,
+            progress=tell,
             before=earlier,
             paired=paired,
             predictions=predictions,

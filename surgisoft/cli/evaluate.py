@@ -30,7 +30,6 @@ from surgisoft.files import write_json
 
 if TYPE_CHECKING:
     from surgisoft.agents.session import Rules
-    from surgisoft.experiments.spec import Experiment
 
 PLACES = ("simulation", "rig")
 """Plants: simulated arm models, or rigs."""
@@ -114,16 +113,11 @@ def evaluate(
 
     from surgisoft.agents.session import evaluate as evaluate_policies
 
-    of_task: object = config
     laid: Rules | None = None
     if rules:
         from surgisoft.experiments.session import ExperimentRules
 
-        spec = _experiment(rules, task, config)
-        place = {"scene": spec.scene} if spec.in_scene else {}
-        task, of_task = spec.scenario, replace(spec.task, **place)
-        laid, seed = ExperimentRules(spec), spec.seed if seed is None else seed
-    seed = seed or 0
+        laid = ExperimentRules.of(rules)
 
     with progress("evaluate") as report_progress:
         found = evaluate_policies(
@@ -137,11 +131,11 @@ def evaluate(
             exact_checks=exact_checks,
             arm=arm,
             scene=scene,
-            config=of_task,
+            config=config,
             rules=laid,
             log=policies if report else policies[:1] if replay else (),
         )
-    about = f"{counted(episodes, 'episode')} of seed {seed}"
+    about = f"{counted(episodes, 'episode')} of seed {found.request.seed}"
     written: list[object] = []
     if json_file:
         write_json(json_file, found.to_json())
@@ -169,20 +163,6 @@ def evaluate(
             "errors are those of the measured key points, camera noise included"
         )
     show_written(written)
-
-
-def _experiment(experiment: Path, task: str | None, config: Path | None) -> "Experiment":
-    """The experiment whose rules hold."""
-    if config:
-        raise InputError("--config and --rules both set the task's fields; give one of the two")
-    from surgisoft.experiments.session import open_experiment
-
-    spec = open_experiment(experiment)
-    if task not in (None, spec.scenario):
-        raise InputError(
-            f"--rules {experiment}: is an experiment of {spec.scenario}, not of {task}"
-        )
-    return spec
 
 
 def _rig_config(

@@ -65,15 +65,12 @@ def export(
 
 
 def _model(source: Path, output: Path, data: list[Path] | None) -> list[Path]:
-    from surgisoft.measurement.histories import check_fits, history_of
-    from surgisoft.surrogate.checkpoint import load_model
-    from surgisoft.surrogate.export import differences, export_arm
+    from surgisoft.measurement.exporting import export_arm
+    from surgisoft.surrogate.export import differences
 
-    model, measured = load_model(source), read_recordings(data) if data else []
-    check_fits(model.spec, measured)
-    histories = {each.name: history_of([each], model.spec.actuation) for each in measured}
+    measured = read_recordings(data) if data else []
     with progress(f"export {source}"):
-        files = export_arm(model, output, histories)
+        files = export_arm(source, output, measured)
     for name, found in differences(output).items():
         print(
             f"{name}: over {found['rows']} rows the files differ from the model by "

@@ -65,20 +65,13 @@ def import_(
     It reports what looks wrong: lengths, reversed key points, clocks that differ. With a
     model of the arm, frames, units, orders, chambers and dead channels are tested, too.
     """
-    from surgisoft.measurement.importing import (
-        import_files,
-        import_lerobot,
-        import_log,
-        load_map,
-    )
+    from surgisoft.measurement.importing import import_recordings
     from surgisoft.measurement.recordings import (
         check_writable,
         find_warnings,
         save_recording,
         summary,
     )
-    from surgisoft.measurement.recordings.lerobot import is_dataset
-    from surgisoft.measurement.recordings.log import SUFFIX as LOG_SUFFIX
     from surgisoft.memory import keep_freed_memory
 
     if draft is not None:
@@ -97,17 +90,7 @@ def import_(
     if to_file and output.suffix not in (".csv", ".parquet"):
         raise InputError(f"{output}: suffix '{output.suffix}', expected .csv, .parquet or a folder")
     name = output.stem if to_file else None
-    if map_name is None and all(path.suffix == LOG_SUFFIX for path in raw):
-        parts = [import_log(path, name or path.stem) for path in raw]
-    elif map_name is None and all(is_dataset(path) for path in raw):
-        parts = [import_lerobot(path, name or path.name) for path in raw]
-    elif map_name is None:
-        raise InputError(
-            "--map is missing: a map file states columns, units and frames; "
-            f"'surgisoft import {raw[0]} --draft map.toml' writes one to start from"
-        )
-    else:
-        parts = import_files(raw, load_map(map_name), name)
+    parts = import_recordings(raw, map_name, name)
     if to_file and len(parts) > 1:
         raise InputError(f"{output}: {len(parts)} recordings, expected a folder for them")
     targets = [output if to_file else output / f"{part.recording.name}.parquet" for part in parts]
@@ -149,9 +132,7 @@ def _draft(raw: list[Path], place: Path, force: bool) -> None:
 def _test_setup(arm: "ArmModel", name: str, recordings: list) -> None:
     """Print what a model shows to be wrong with the set-up of recordings; name: of the model."""
     from surgisoft.diagnosis.setup import find_setup_faults
-    from surgisoft.measurement.histories import check_fits
 
-    check_fits(arm.spec, recordings, sized=False)
     found = find_setup_faults(arm, recordings)
     if found is None:
         print(f"set-up: no fault that {name} shows")

@@ -8,7 +8,6 @@ from surgisoft.cli import app
 from surgisoft.cli.amended import (
     NOT_CLAIMED,
     claim_other_folder,
-    save_amended,
     show_parameters,
     write_before_and_after,
 )
@@ -61,6 +60,7 @@ def improve(
     claim_other_folder(output, model, force)
 
     from surgisoft.diagnosis.improve import improve as improve_model
+    from surgisoft.surrogate.checkpoint import save_model
 
     with progress("improve") as tell:
         done = []
@@ -82,7 +82,7 @@ def improve(
     warn_all(result.notes)
     written = []
     if result.claimed:
-        save_amended(result, output, model, measured, force)
+        save_model(result.model, output, result.to_json(), force)
     if json_file:
         write_json(json_file, result.to_json())
         written.append(json_file)

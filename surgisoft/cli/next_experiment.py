@@ -164,17 +164,9 @@ def _record(result, rig: str, schedule: Path, record: Path, force: bool) -> None
 
     A simulated rig changes its setup itself; a real one has to be changed by a person first.
     """
-    import shlex
-
     from surgisoft.rig.registry import parse_rig, rig_options
 
-    options: dict[str, list[float]] = {}
-    for word in shlex.split(result.options):
-        if word.startswith("--"):
-            values = options[word.removeprefix("--").replace("-", "_")] = []
-        else:
-            values.append(float(word))
-    setup: dict[str, Any] = {name: tuple(x) if len(x) > 1 else x[0] for name, x in options.items()}
+    setup: dict[str, Any] = dict(result.rig_options)
     known = rig_options(parse_rig(rig).name)
     lacking = [name for name in setup if name not in known or name in parse_rig(rig).options]
     if result.by_hand or lacking:

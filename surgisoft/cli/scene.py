@@ -111,7 +111,7 @@ def new(
     """Make a scene: repair the meshes, place the lesion, find mounts for the arms."""
     _check_meshes(meshes)
 
-    from surgisoft.scene.author import NoMounts, author, check_target, write_scene
+    from surgisoft.scene.author import NoMounts, check_target, write_scene
     from surgisoft.scene.meshio import UnknownUnit
     from surgisoft.scene.segmentation import parse_label
 
@@ -129,19 +129,18 @@ def new(
     )
     check_target(output, force)
 
-    from surgisoft.tasks.world.reach import blank_mounts, reach_of
+    from surgisoft.tasks.world.authoring import make_scene
 
     tools = [tool.strip() for tool in arms.split(",")]
-    mounts = blank_mounts(tools, _models(arm, tools))
-    reaches = {name: reach_of(mount) for name, mount in mounts.items()}
+    asked = (tools, _models(arm, tools), _name(output))
     try:
         try:
             with progress("scene new") as report:
-                made = author(request, reaches, mounts, _name(output), report)
+                made = make_scene(request, *asked, report)
         except UnknownUnit as error:
             request = _ask_unit(request, error)
             with progress("scene new") as report:
-                made = author(request, reaches, mounts, _name(output), report)
+                made = make_scene(request, *asked, report)
     except NoMounts as error:
         for note in error.notes:
             print(note)
@@ -265,28 +264,14 @@ def _ask_unit(request, error):
 
 
 def _request(meshes, lesion, direction, diameter, clearance, **frame):
-    """The request for a new scene; raises InputError for contradicting or invalid options.
+    """The request for a new scene, with the role of each file.
 
     `frame` holds the fields of `Request` that tell how the files are to be read.
     """
-    import numpy as np
-
     from surgisoft.scene.author import Request
     from surgisoft.scene.mesh import ROLES
     from surgisoft.scene.spec import LimitsSpec
 
-    if lesion is not None and direction is not None:
-        raise InputError("both --lesion and --lesion-direction are given; expected one of them")
-    if direction is not None and not 1e-9 < float(np.linalg.norm(direction)) < np.inf:
-        raise InputError(f"--lesion-direction is {direction}; expected a vector that is not zero")
-    if lesion is not None and not np.isfinite(lesion).all():
-        raise InputError(f"--lesion is {lesion}; expected finite coordinates")
-    if diameter is not None and not 0.5 <= diameter <= 500.0:
-        raise InputError(f"--diameter is {diameter:g}; expected 0.5 to 500 mm")
-    if not 0.0 <= frame["margin_mm"] <= 100.0:
-        raise InputError(f"--margin is {frame['margin_mm']:g}; expected 0 to 100 mm")
-    if not 0.0 <= clearance <= 100.0:
-        raise InputError(f"--clearance is {clearance:g}; expected 0 to 100 mm")
     paths, roles = [], []
     for i, text in enumerate(meshes):
         path, colon, role = text.rpartition(":")

@@ -19,7 +19,7 @@ from surgisoft.diagnosis.estimation.effects import fit_effects
 from surgisoft.diagnosis.estimation.intervals import Parameter
 from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
-from surgisoft.diagnosis.other_models import open_model, refuse_predictions
+from surgisoft.diagnosis.other_models import name_of, open_model, refuse_predictions
 from surgisoft.diagnosis.pairs import LEAST_SHARE, Change, Paired, before_and_after
 from surgisoft.diagnosis.refit import Refit, apart_mm, can_hide, fit_together, refit_reason
 from surgisoft.diagnosis.refit import refit as refit_effects
@@ -184,6 +184,10 @@ class Amendment:
     differences."""
     refit: Refit | None = None
     """The comparison that fitted network and effects together; None where they were not."""
+    amended_from: str = ""
+    """Name of the given model; empty for one that was given as an object."""
+    recordings: tuple[str, ...] = ()
+    """Names of the recordings."""
 
     @property
     def claimed(self) -> bool:
@@ -246,7 +250,10 @@ class Amendment:
         return f"{self.held_out.sentence}, fitted together with the network; {network}"
 
     def to_json(self) -> dict:
-        """Plain values, as `amend --json` writes them and as the new model's folder keeps them."""
+        """Plain values, as `amend --json` writes them.
+
+        The new model's folder keeps them too: `save_model(found.model, folder, found.to_json())`.
+        """
         held_out, training = self.held_out, self.training
         values = {
             "effects": list(self.effects),
@@ -263,6 +270,8 @@ class Amendment:
             "seconds": self.seconds,
             "change": self.change and self.change.to_json(),
             "error_model_mm": self.model_error and self.model_error.to_json(),
+            "amended_from": self.amended_from,
+            "recordings": list(self.recordings),
         }
         return with_former_keys(values, {"error_open_mm": "error_training_mm"})
 
@@ -308,6 +317,7 @@ def amend(
     tell = progress or (lambda text: None)
     names = [named_effect(given) for given in ([effects] if isinstance(effects, str) else effects)]
     refuse_predictions(model)
+    given = name_of(model)
     model, recordings, before = open_model(model, recordings, before, None, error_mm)
     model, recordings, notes = open_inputs(model, recordings)
     tell("predicting")
@@ -403,6 +413,8 @@ def amend(
         change=None if both is None else both.change,
         model_error=fall_of(whole, whole.with_model(better)) if is_paired else None,
         refit=judged,
+        amended_from=given,
+        recordings=tuple(each.name for each in recordings),
     )
 
 

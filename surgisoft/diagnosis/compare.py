@@ -18,7 +18,7 @@ from surgisoft.diagnosis.inputs import (
     refuse_rows_of_fit,
     with_known_residuals,
 )
-from surgisoft.diagnosis.other_models import open_model
+from surgisoft.diagnosis.other_models import name_of, open_model
 from surgisoft.diagnosis.pairs import Change, Paired, before_and_after
 from surgisoft.diagnosis.residuals import (
     LEAST_BLOCKS,
@@ -331,10 +331,7 @@ def compare_all(
     number of models that are done.
     """
     if names is None:
-        names = [
-            Path(m).name if isinstance(m, str | Path) else f"model {i}"
-            for i, m in enumerate(models, 1)
-        ]
+        names = [name_of(model) or f"model {i}" for i, model in enumerate(models, 1)]
     measured = load_recordings(recordings)
     results = []
     for done, (model, name) in enumerate(zip(models, names, strict=True)):

@@ -16,7 +16,7 @@ from surgisoft.diagnosis.estimation.effects import Fitted, fit_effects, fit_plau
 from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
 from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
-from surgisoft.diagnosis.other_models import open_model, refuse_predictions
+from surgisoft.diagnosis.other_models import name_of, open_model, refuse_predictions
 from surgisoft.diagnosis.refit import JointFit, apart_mm, fit_together
 from surgisoft.diagnosis.residuals import Sealed, model_discrepancy, residual_table
 from surgisoft.errors import InputError
@@ -94,6 +94,10 @@ class Improvement:
     """Recordings under another direction of gravity, or beyond the range of the model's fit."""
     diagnoses: tuple[Diagnosis, ...] = ()
     """The diagnosis of each model in turn: the first is that of the given one."""
+    amended_from: str = ""
+    """Name of the given model; empty for one that was given as an object."""
+    recordings: tuple[str, ...] = ()
+    """Names of the recordings."""
 
     @property
     def steps(self) -> list[tuple[str, float]]:
@@ -131,7 +135,10 @@ class Improvement:
         return f"{names}: {fall.sentence}"
 
     def to_json(self) -> dict:
-        """Plain values, as `improve --json` writes them."""
+        """Plain values, as `improve --json` writes them.
+
+        The new model's folder keeps them too: `save_model(found.model, folder, found.to_json())`.
+        """
         return {
             "sentence": self.sentence,
             "claimed": self.claimed,
@@ -142,6 +149,8 @@ class Improvement:
             "parameters": [parameter.to_json() for parameter in self.parameters],
             "notes": list(self.notes),
             "seconds": self.seconds,
+            "amended_from": self.amended_from,
+            "recordings": list(self.recordings),
         }
 
 
@@ -174,6 +183,7 @@ def improve(
     begin = time.perf_counter()
     tell = progress or (lambda done: None)
     refuse_predictions(model)
+    given = name_of(model)
     model, recordings, _ = open_model(model, recordings, None, None, error_mm)
     model, recordings, notes = open_inputs(model, recordings)
     known, sealed = model.training_residuals, Sealed(recordings)
@@ -275,6 +285,8 @@ def improve(
         seconds=time.perf_counter() - begin,
         notes=notes,
         diagnoses=tuple(diagnoses),
+        amended_from=given,
+        recordings=tuple(each.name for each in recordings),
     )
 
 

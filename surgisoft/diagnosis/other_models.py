@@ -79,6 +79,11 @@ def is_predictions_file(model: Any) -> bool:
     return isinstance(model, str | Path) and Path(model).suffix in SUFFIXES
 
 
+def name_of(model: Any) -> str:
+    """Name of a model that was given by its folder, file or name; empty for an object."""
+    return Path(model).name if isinstance(model, str | Path) else ""
+
+
 def refuse_predictions(model: Any) -> None:
     """Raise InputError where a model to be amended is a file of predictions."""
     if is_predictions_file(model):

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from surgisoft.agents.on_rig import rigs_by_arm
 from surgisoft.agents.policies import Policy
@@ -65,14 +66,40 @@ def open_experiment(name: str | Path) -> Experiment:
 class ExperimentRules:
     """The phases, interlock and limits of an experiment, laid over a task that `evaluate` places.
 
-    Satisfies `surgisoft.agents.session.Rules`. With the experiment's seed and task, an episode of
-    `evaluate` is that of the experiment.
+    Satisfies `surgisoft.agents.session.Rules`: `evaluate(policies, rules=ExperimentRules.of(name))`
+    takes the experiment's task, scene and seed, so that its episode k is that of the experiment.
     """
 
     spec: Experiment
     """The experiment."""
     without: tuple[str, ...] = DROPPED
     """See `Rules`."""
+
+    @classmethod
+    def of(cls, name: str | Path) -> ExperimentRules:
+        """The rules of an experiment, by its path or a packaged name."""
+        return cls(open_experiment(name))
+
+    @property
+    def name(self) -> str:
+        """Name of the experiment."""
+        return self.spec.name
+
+    @property
+    def task(self) -> str:
+        """Name of the experiment's task."""
+        return self.spec.scenario
+
+    @property
+    def config(self) -> Any:
+        """The experiment's configuration of its task, with its scene."""
+        place = {"scene": self.spec.scene} if self.spec.in_scene else {}
+        return replace(self.spec.task, **place)
+
+    @property
+    def seed(self) -> int:
+        """Seed of the experiment's episodes."""
+        return self.spec.seed
 
     def over(self, task: Task) -> PhasedTask:
         """The task under the rules."""

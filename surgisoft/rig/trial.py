@@ -43,7 +43,7 @@ def rig_of_trial(
 
 def collect(
     protocol: str | Path | Protocol,
-    rig: Rig | str | None = None,
+    rig: Rig | str | None = "virtual",
     *,
     seed: int | None = None,
     trial: int = 0,

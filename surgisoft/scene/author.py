@@ -72,6 +72,10 @@ MARGIN_MM = 5.0
 tumours aims at (Ahmed et al. 2014, Radiology 273:241)."""
 DIAMETER_MM = 20.0
 """Diameter of the ring where the user gives none and the image holds no lesion (mm)."""
+DIAMETERS_MM = (0.5, 500.0)
+"""Least and largest diameter of a ring that is accepted (mm): a slip of the unit is outside."""
+WIDEST_MM = 100.0
+"""Largest margin and clearance that are accepted (mm)."""
 COARSE_RING = 36
 """Number of ring points during the search for mounts."""
 CROSSING = "the surface intersects itself, only its outermost part counts; faces inside the solid"
@@ -110,6 +114,24 @@ class Request:
     """The camera."""
     limits: LimitsSpec = field(default_factory=LimitsSpec)
     """The limits."""
+
+    def __post_init__(self):
+        """Raise InputError for contradicting places of the lesion and for lengths out of range."""
+        point, direction, diameter_mm = self.lesion, self.lesion_direction, self.diameter_mm
+        if point is not None and direction is not None:
+            raise InputError("both --lesion and --lesion-direction are given; expected one of them")
+        if direction is not None and not 1e-9 < float(np.linalg.norm(direction)) < np.inf:
+            raise InputError(
+                f"--lesion-direction is {direction}; expected a vector that is not zero"
+            )
+        if point is not None and not np.isfinite(point).all():
+            raise InputError(f"--lesion is {point}; expected finite coordinates")
+        low, high = DIAMETERS_MM
+        if diameter_mm is not None and not low <= diameter_mm <= high:
+            raise InputError(f"--diameter is {diameter_mm:g}; expected {low:g} to {high:g} mm")
+        for name, value in (("margin", self.margin_mm), ("clearance", self.limits.clearance_mm)):
+            if not 0.0 <= value <= WIDEST_MM:
+                raise InputError(f"--{name} is {value:g}; expected 0 to {WIDEST_MM:g} mm")
 
 
 @dataclass(frozen=True, eq=False)

@@ -322,7 +322,7 @@ def test_next_experiment_records_on_a_simulated_rig_and_asks_a_person_at_a_real_
         1.0,
         (Pair(("payload", "drift"), 0.5, 0.9),),
         ("turn the base",),
-        "--roll-deg 90",
+        {"roll_deg": 90.0},
         None,
     )
     monkeypatch.setattr(designing, "next_experiment", lambda *_, **__: found)
@@ -348,7 +348,7 @@ def test_next_experiment_records_on_a_simulated_rig_and_asks_a_person_at_a_real_
         assert run([*command, "--rig", rig]) == 2
         assert error in capsys.readouterr().err
         assert not plan.exists(), "a rig that cannot be is refused before the search"
-    plain = replace(found, options="")
+    plain = replace(found, rig_options={})
     monkeypatch.setattr(designing, "next_experiment", lambda *_, **__: plain)
     assert run([*command, "--rig", f"serial:port={tmp_path / 'none'},mocap=udp:9763"]) == 2
     error = capsys.readouterr().err

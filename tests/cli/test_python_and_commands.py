@@ -1,21 +1,39 @@
 """The functions of the package and the commands give the same numbers."""
 
+import csv
+import inspect
 import json
 import re
+from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from surgisoft.agents.on_rig import RigConfig
+from surgisoft.agents.session import EvaluationRequest, evaluate
 from surgisoft.cli import run
 from surgisoft.diagnosis.amend import amend
 from surgisoft.diagnosis.compare import compare
 from surgisoft.diagnosis.design.next_experiment import next_experiment
 from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.diagnosis.improve import improve
+from surgisoft.errors import InputError
+from surgisoft.experiments.session import ExperimentRules, finish_experiment, start_experiment
+from surgisoft.live.change import AlarmDesign
+from surgisoft.live.session import RunRequest
+from surgisoft.measurement.fitting import fit
+from surgisoft.measurement.importing import import_recordings
 from surgisoft.measurement.protocols import make_protocol
-from surgisoft.measurement.recordings import save_recording
+from surgisoft.measurement.recordings import load_recording, save_recording
+from surgisoft.replay.show import open_replay
 from surgisoft.rig import VirtualRig
+from surgisoft.rig.trial import collect
+from surgisoft.scene.author import Request
+from surgisoft.scene.spec import LimitsSpec
 from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
+from surgisoft.surrogate.fit import FitConfig
+from tests.replay.reading import entities, values_of
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
@@ -86,6 +104,10 @@ def test_a_turned_bench_gives_one_result_everywhere(lab, capsys):
     new = ["-o", str(lab / "new"), "--force"]
     command = ["amend", arm, "--effect", "payload", "--data", data, *new]
     assert as_written(amended) == of_command(lab, *command)
+    save_model(amended.model, lab / "mine", amended.to_json())
+    mine, theirs = (json.loads((lab / f / "report.json").read_text()) for f in ("mine", "new"))
+    assert timeless(mine) == timeless(theirs)
+    assert (mine["amended_from"], mine["recordings"]) == ("arm", ["turned"])
     assert amended.model.spec.gravity is None
     for result in (compared, diagnosed, amended):
         assert any("35 degrees" in note for note in result.notes)
@@ -119,9 +141,13 @@ def test_the_next_experiment_asks_what_diagnose_asks(lab):
     arm, data = str(lab / "arm"), str(lab / "turned.parquet")
     found = next_experiment(arm, data, ["payload", "misalignment"], 6.0)
     more = ["--between", "payload", "misalignment", "--minutes", "6", "--force"]
-    command = ["next-experiment", arm, data, *more, "-o", str(lab / "s.csv")]
-    assert as_written(found) == of_command(lab, *command)
+    new = ["-o", str(lab / "s.csv"), "--record", str(lab / "next.parquet")]
+    assert as_written(found) == of_command(lab, "next-experiment", arm, data, *more, *new)
     assert any("35 degrees" in note for note in found.notes)
+    mine = collect(lab / "s.csv", **found.rig_options)
+    theirs = load_recording(lab / "next.parquet")
+    np.testing.assert_array_equal(mine.key_points_mm, theirs.key_points_mm)
+    np.testing.assert_array_equal(mine.gravity, theirs.gravity)
 
 
 def test_the_next_experiment_sees_the_problem_of_the_diagnosis(lab, monkeypatch):
@@ -152,3 +178,163 @@ def test_the_next_experiment_sees_the_problem_of_the_diagnosis(lab, monkeypatch)
     assert one.index.equal(other.index)
     assert other.model.spec.gravity is None
     assert (one.reference.residual == other.reference.residual).all()
+
+
+def default_of(parameters, name: str):
+    """A default, as the work sees it: nothing given is nothing, whatever the type."""
+    value = parameters[name].default
+    if isinstance(value, list | tuple):
+        value = tuple(value) or None
+    return value.get("default") if isinstance(value, dict) else value
+
+
+SAME_DEFAULTS = [
+    ("compare", "compare", compare, {"model_error": "error_mm"}, 5),
+    ("diagnose", "diagnose", diagnose, {"model_error": "error_mm"}, 7),
+    ("amend", "amend", amend, {"model_error": "error_mm"}, 4),
+    ("improve", "improve", improve, {"model_error": "error_mm", "most": "most_effects"}, 3),
+    ("next_experiment", "next_experiment", next_experiment, {"model_error": "error_mm"}, 4),
+    ("fit", "fit", fit, {}, 3),
+    ("fit", "fit", FitConfig, {}, 7),
+    ("collect", "collect", collect, {}, 5),
+    ("evaluate", "evaluate", EvaluationRequest, {}, 7),
+    ("evaluate", "evaluate", RigConfig, {"seed": "seed of the episodes"}, 2),
+    ("run_", "run", RunRequest, {"rate": "rate_hz", "reference": "reference_s"}, 11),
+    ("run_", "run", AlarmDesign, {"false_alarm": "false_alarm_h"}, 1),
+    ("replay", "replay", open_replay, {"time": "time_s"}, 6),
+    ("scene", "new", Request, {"margin": "margin_mm", "diameter": "diameter_mm"}, 7),
+    ("scene", "new", LimitsSpec, {"clearance": "clearance_mm"}, 1),
+    ("experiment", "run", start_experiment, {}, 5),
+    ("experiment", "run", finish_experiment, {}, 3),
+]
+"""Module and function of a command, function or dataclass of its work, names that differ, and how
+many options at least both have."""
+
+
+BY_MEANING = {"observer_gain", "output", "size"}
+"""Options whose absence is stated in another way: a gain selects another observer, the command
+`run` always writes a recording, and a picture has another default size than a notebook's frame."""
+
+
+@pytest.mark.parametrize(("module", "command", "work", "names", "least"), SAME_DEFAULTS)
+def test_an_option_that_is_not_given_has_one_default(module, command, work, names, least):
+    options = inspect.signature(getattr(import_module(f"surgisoft.cli.{module}"), command))
+    given = {names.get(name, name): name for name in options.parameters}
+    known = inspect.signature(work).parameters
+    shared = [name for name in given if name in known]
+    assert len(shared) >= least, shared
+    for name in set(shared) - BY_MEANING:
+        option = default_of(options.parameters, given[name])
+        own = default_of(known, name)
+        assert option == own, name
+
+
+@pytest.fixture
+def short(tmp_path):
+    """An experiment of half a second without a scene."""
+    file = tmp_path / "short.toml"
+    file.write_text(
+        'name = "short"\nscenario = "track_circle"\nseed = 5\n[limits]\ntime_s = 0.6\n'
+        "[task.follow]\nsize_mm = 12.0\n"
+        '[[phases]]\nname = "go"\ntimeout_s = 9.0\narm = "policy"\n'
+    )
+    return file
+
+
+def test_an_experiment_gives_one_result(short, tmp_path):
+    spec, folder = start_experiment(short, tmp_path / "mine", repeats=2)
+    results, files = finish_experiment(spec, folder, replays=False)
+    words = ["--repeats", "2", "--no-replays", "-o", str(tmp_path / "theirs")]
+    assert run(["experiment", "run", str(short), *words]) == 0
+    assert len(results.rows) == 2
+    tables = [path.relative_to(folder) for path in files if path.suffix in (".csv", ".md")]
+    assert tables
+    for name in tables:
+        assert (folder / name).read_text() == (tmp_path / "theirs" / name).read_text(), name
+
+
+def test_evaluation_under_the_rules_of_an_experiment_gives_one_result(short, tmp_path):
+    """Task, fields and seed come from the rules, in Python as on the command line."""
+    found = evaluate("scripted", rules=ExperimentRules.of(short), episodes=2)
+    rules = ["--rules", str(short), "--episodes", "2"]
+    assert as_written(found) == of_command(tmp_path, "evaluate", "scripted", *rules)
+    assert found.request.seed == 5
+    assert found.to_json()["task_config"]["follow"]["size_mm"] == 12.0
+
+
+def test_the_options_of_a_rig_make_one_configuration(monkeypatch):
+    """Only the call is caught: what it then does is the function's."""
+    from surgisoft.agents import session
+
+    seen = {}
+
+    def caught(policies, task, **fields):
+        seen.update(fields)
+        raise InputError("enough")
+
+    monkeypatch.setattr(session, "evaluate", caught)
+    options = "--on rig --robot-seed 3 --hidden creep:0.5 --no-cameras --observer-gain 0.2"
+    assert run(["evaluate", "scripted", "--task", "track_circle", *options.split()]) == 2
+    hidden = (("creep", 0.5),)
+    assert seen["rig"].gains == RigConfig(cameras=False, observer_gain=0.2, adapts=False).gains
+    assert (seen["rig"].seed, seen["rig"].hidden) == (3, hidden)
+    assert run(["evaluate", "scripted", "--task", "track_circle", "--on", "rig"]) == 2
+    assert seen["rig"] == RigConfig()
+
+
+def test_an_import_gives_one_recording(tmp_path):
+    raw, table = tmp_path / "raw", tmp_path / "map.toml"
+    raw.mkdir()
+    times = np.arange(40) / 20.0
+    for take in (1, 2):
+        rows = np.stack([times, *(take * np.sin(times + k) + k for k in range(5))], axis=1)
+        with (raw / f"take{take}.csv").open("w", newline="") as stream:
+            csv.writer(stream).writerows([["t", "u1", "u2", "x", "y", "z"], *rows.tolist()])
+    table.write_text(
+        '[time]\ncolumn = "t"\n[measured]\ncolumns = ["u1", "u2"]\nunit = "psi"\n'
+        '[key_points]\npositions = [["x", "y", "z"]]\nunit = "cm"\n'
+    )
+    (mine,) = import_recordings(raw, table, "both")
+    out = tmp_path / "both.parquet"
+    assert run(["import", str(raw), "--map", str(table), "-o", str(out)]) == 0
+    theirs = load_recording(out)
+    for name in ("t_s", "run", "measured", "key_points_mm"):
+        np.testing.assert_array_equal(getattr(mine.recording, name), getattr(theirs, name), name)
+    assert (mine.recording.name, mine.recording.unit) == (theirs.name, theirs.unit)
+    assert len(mine.recording.runs) == 2
+    parts = import_recordings([raw / "take1.csv", raw / "take2.csv"], table)
+    assert run(["import", str(raw), "--map", str(table), "-o", str(tmp_path / "each")]) == 0
+    for part in parts:
+        other = load_recording(tmp_path / "each" / f"{part.recording.name}.parquet")
+        np.testing.assert_array_equal(part.recording.key_points_mm, other.key_points_mm)
+
+
+def test_a_replay_gives_one_file(short, tmp_path):
+    command = ["experiment", "run", str(short), "--no-replays", "-o", str(tmp_path / "r")]
+    assert run(command) == 0
+    (log,) = (tmp_path / "r").rglob("*.npz")
+    mine = open_replay(log, save=tmp_path / "mine.rrd")
+    assert run(["replay", str(log), "--save", str(tmp_path / "theirs.rrd")]) == 0
+    assert mine.path == tmp_path / "mine.rrd"
+    seen = entities(tmp_path / "mine.rrd")
+    assert seen == entities(tmp_path / "theirs.rrd")
+    for entity in sorted(seen):
+        values = [values_of(tmp_path / f"{name}.rrd", entity) for name in ("mine", "theirs")]
+        assert values[0] == values[1], entity
+
+
+def test_every_command_is_compared_with_its_function():
+    """A new command needs a row above, or a reason why it has no function of its own."""
+    from surgisoft.cli import COMMANDS
+
+    compared = {module for module, *_ in SAME_DEFAULTS}
+    reasons = {
+        "import_": "compared above: its options are arguments of the same names",
+        "export": "it calls one function for a run and one for a model",
+        "train": "tests/test_api.py compares two runs",
+        "demo": "it has no option but the folder",
+        "rig": "it lists, or prints the result of one check",
+        "benchmark": "studies of the repository",
+    }
+    assert compared.isdisjoint(reasons)
+    assert compared | set(reasons) == set(COMMANDS)

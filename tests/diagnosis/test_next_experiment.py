@@ -98,8 +98,10 @@ def test_turned_benches_have_the_rigs_own_gravity():
         if setting.roll_deg:
             truth = VirtualRig(0, gravity=weight, roll_deg=setting.roll_deg).gravity
             np.testing.assert_allclose(setting.gravity(weight), truth, atol=1e-12)
-            assert setting.options == f"--roll-deg {setting.roll_deg:g}", name
+            assert setting.rig_options(weight) == {"roll_deg": setting.roll_deg}, name
     np.testing.assert_allclose(SETUPS["upside_down"].gravity(weight), -weight)
+    asked = SETUPS["upside_down"].rig_options(weight)["gravity"]
+    np.testing.assert_allclose(asked, -weight, atol=1e-4)
 
 
 def test_the_recommended_schedule_runs_on_the_rig(arm):

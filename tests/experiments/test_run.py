@@ -235,10 +235,8 @@ def test_an_experiment_and_evaluate_by_its_rules_give_the_same_episodes(tmp_path
     *_, setting = settings(with_policy(spec, "ring"))
     assert setting.case.policy != "scripted"
     (row,) = experiment_run.roll_out_block(spec, setting, 0, 1).rows
-    rules, task = ExperimentRules(spec), replace(spec.task, scene=spec.scene)
-    found = session.evaluate(
-        "ring", rig=RigConfig(seed=1), config=task, rules=rules, seed=spec.seed, episodes=1
-    )
+    rules = ExperimentRules(spec)
+    found = session.evaluate("ring", rig=RigConfig(seed=1), rules=rules, episodes=1)
     numbers = found.results[0].per_episode
     assert {"success", "beam_error_mean_mm", "clearance_mm", "time_s"} <= set(numbers)
     for name, values in numbers.items():

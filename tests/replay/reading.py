@@ -20,3 +20,14 @@ def column(path, entity: str, component: str, timeline: str = "step") -> dict[in
 def entities(path) -> set[str]:
     """Every entity of the recording."""
     return {str(chunk.entity_path) for chunk in RrdReader(path).stream()}
+
+
+def values_of(path, entity: str) -> dict[str, list]:
+    """Component or timeline -> the entity's values in order, without the clock of the computer."""
+    found: dict[str, list] = {}
+    for chunk in RrdReader(path).stream().filter(content=entity):
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names:
+            if name not in ("rerun.controls.RowId", "log_time", "log_tick"):
+                found.setdefault(name, []).extend(batch.column(name).to_pylist())
+    return found

@@ -18,6 +18,7 @@ from surgisoft.scene.author import (
     choose_sites,
     prepare,
     rounded_mount,
+    write_scene,
 )
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.check import REASONS, check_scene, mounted_arms, reach_patch, sentence
@@ -31,6 +32,7 @@ from surgisoft.surrogate.checkpoint import save_model
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import ConstantCurvature
 from surgisoft.tasks.world.arm import Pneumatics, Randomisation
+from surgisoft.tasks.world.authoring import make_scene
 from surgisoft.tasks.world.random_streams import streams
 from surgisoft.tasks.world.reach import reaches_of
 from surgisoft.tasks.world.world import WorldConfig, scene_world, single_arm_world
@@ -99,12 +101,21 @@ def test_every_ring_point_is_hit_by_an_arm_that_touches_nothing(made):
     assert cut.step_mm.max() < 2.0 * verdict.work.clearance_mm.min()
 
 
-def test_the_same_meshes_give_the_same_scene(made, tmp_path):
+def test_the_same_meshes_give_the_same_scene(made, tmp_path, capsys):
+    """In Python as by the command, and by the factor of the unit as by its name."""
     source = made[1].parent
-    assert new(tmp_path / "again", source / "organ.stl", source / "rod.obj", "--scale", 1e3) == 0
-    assert (tmp_path / "again" / FILE).read_text().splitlines()[1:] == (
-        made[1] / FILE
-    ).read_text().splitlines()[1:]
+    meshes = (source / "organ.stl", source / "rod.obj")
+    again = make_scene(Request(meshes, ("organ", "keep-out"), scale=1e3), name="scene")
+    write_scene(again.scene, tmp_path / "again")
+    files = sorted(path.name for path in made[1].iterdir())
+    assert files == sorted(path.name for path in (tmp_path / "again").iterdir())
+    for name in files:
+        assert (tmp_path / "again" / name).read_bytes() == (made[1] / name).read_bytes(), name
+    capsys.readouterr()
+    assert run(["scene", "check", str(made[1])]) == 0
+    said = capsys.readouterr().out
+    assert sentence(again.check) in said
+    assert all(finding.value in said for finding in again.check.findings)
 
 
 def test_both_arms_and_their_shafts_clear_each_other(made):

@@ -14,6 +14,7 @@ from onnx.reference import ReferenceEvaluator
 
 from surgisoft.cli import run as surgisoft
 from surgisoft.errors import InputError
+from surgisoft.measurement.exporting import export_arm as export_recordings
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import save_recording
@@ -117,6 +118,9 @@ def test_files_are_compared_over_whole_recordings(bench, tmp_path, capsys):
     found = differences(tmp_path / "arm")["two"]
     assert found["rows"] == 80
     assert 0.0 < found["largest_difference_mm"] < 1e-5
+    save_recording(replace(recording, unit="psi"), tmp_path / "psi.csv")
+    with pytest.raises(InputError, match="psi, but the model has kPa"):
+        export_recordings(tmp_path / "small", tmp_path / "new", tmp_path / "psi.csv")
 
 
 def test_the_step_takes_any_batch_and_the_state_is_what_arm_json_says(exported):

@@ -9,7 +9,7 @@ every experimental setup that touches a competing effect.
 
 import copy
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -575,8 +575,10 @@ class Recommendation:
     """Every pair of competing effects."""
     steps: tuple[str, ...]
     """What to do, in words."""
-    options: str = ""
-    """Options of `surgisoft collect` for the experimental setup on the virtual rig."""
+    rig_options: Mapping[str, float | tuple[float, float, float]] = field(default_factory=dict)
+    """Options of `surgisoft.collect` for the experimental setup on the virtual rig: `collect(file,
+    **found.rig_options)` with the file of the schedule, or `protocol`, does what `next-experiment
+    --record` does. Empty where nothing is to be changed, and where the rig has no such option."""
     isolability: Isolability | None = field(default=None, repr=False)
     """What the recordings and the experiment together say about the competing effects."""
     notes: tuple[str, ...] = ()
@@ -586,6 +588,15 @@ class Recommendation:
     def separates(self) -> tuple[tuple[str, str], ...]:
         """The pairs that it is expected to tell apart."""
         return tuple(pair.effects for pair in self.pairs if pair.after >= SURE)
+
+    @property
+    def options(self) -> str:
+        """The options of `surgisoft collect` for the experimental setup on the virtual rig."""
+        return " ".join(
+            f"--{name.replace('_', '-')} "
+            + (f"{value:g}" if isinstance(value, float) else " ".join(f"{v:.4f}" for v in value))
+            for name, value in self.rig_options.items()
+        )
 
     @property
     def by_hand(self) -> bool:
@@ -791,10 +802,7 @@ def _worded(question: Question, plan: Plan, limits: np.ndarray) -> Recommendatio
         Pair((a, b), 0.5 if before is None else before.pair(a, b), plan.result.pair(a, b))
         for a, b in pairs_of(plan.result.names)
     )
-    options = setting.options
-    gravity = setting.gravity(question.model.facts.gravity)
-    if gravity is not None:
-        options = options.format(gravity=" ".join(f"{v:.4f}" for v in gravity))
+    options = setting.rig_options(question.model.facts.gravity)
     words = asdict(words_for(question.model.spec.unit))
     what = "; ".join(
         f"{plan.figures.count(f)} x {SIGNALS[f].about.format(**words)}"

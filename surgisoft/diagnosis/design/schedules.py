@@ -22,6 +22,9 @@ REST_MINUTES = 0.5
 INSET = 0.02
 """Share of the range that is left free at both ends, so that no command leaves the arm's range."""
 
+GRAVITY_DIGITS = 4
+"""Decimals of a direction of gravity that is asked for: a bench is not turned as finely."""
+
 REFERENCE = ("ramps", "steps", "holds", "reversals", "ladder", "wander")
 """Excitation signals of the varied schedule on which the plausible size of an effect is stated."""
 
@@ -36,8 +39,6 @@ class Setup:
     """What a person does to the bench, with the places of `Words`; empty: nothing is to be done."""
     minutes: float
     """Time that this takes, minutes."""
-    options: str = ""
-    """Options of `surgisoft collect` for the same on the virtual rig."""
     roll_deg: float = 0.0
     """Turn of the base about its own z axis, degrees."""
     flipped: bool = False
@@ -55,6 +56,20 @@ class Setup:
     def moves_weight(self) -> bool:
         """Whether the arm's own weight, or a known one, then pulls otherwise."""
         return bool(self.roll_deg or self.flipped or self.payload_g)
+
+    def rig_options(self, weight) -> dict[str, float | tuple[float, float, float]]:
+        """Options of `collect` for it on the virtual rig; weight: (3,) as for `gravity`, or None.
+
+        Empty where nothing is to be done, and where the rig has no option for it.
+        """
+        if self.flipped:
+            turned = self.gravity(weight)
+            if turned is None:
+                return {}
+            x, y, z = (round(value, GRAVITY_DIGITS) for value in turned)
+            return {"gravity": (x, y, z)}
+        values = {"roll_deg": self.roll_deg, "payload_g": self.payload_g}
+        return {name: value for name, value in values.items() if value}
 
     def gravity(self, weight) -> tuple[float, float, float] | None:
         """Unit vector of weight (3,) in the base frame, from that of the bench as it stands."""
@@ -80,28 +95,24 @@ _EVERY_SETUP = (
         "roll_90",
         "turn the arm's base by 90 degrees about its own axis",
         2.0,
-        "--roll-deg 90",
-        90.0,
+        roll_deg=90.0,
     ),
     Setup(
         "roll_180",
         "turn the arm's base by 180 degrees about its own axis",
         2.0,
-        "--roll-deg 180",
-        180.0,
+        roll_deg=180.0,
     ),
     Setup(
         "upside_down",
         "turn the bench upside down, so that the weight pulls the other way",
         3.0,
-        "--gravity {gravity}",
         flipped=True,
     ),
     Setup(
         "known_mass",
         "hang a known mass on the tip, about a fifth of the arm's own (2 g on the virtual rig)",
         1.0,
-        "--payload-g 2",
         payload_g=2.0,
     ),
     Setup("no_support", "move everything away that the arm's body may lean on", 1.0),

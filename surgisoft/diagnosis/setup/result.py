@@ -25,7 +25,7 @@ from surgisoft.diagnosis.setup.search import (
 )
 from surgisoft.diagnosis.setup.words import SetupFault, faults_of, joined, signed_axes
 from surgisoft.files import with_former_keys
-from surgisoft.measurement.histories import actuation_of
+from surgisoft.measurement.histories import actuation_of, check_fits
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.model import ArmModel
 
@@ -115,8 +115,9 @@ def find_setup_faults(model: ArmModel, recordings: Sequence[Recording]) -> Setup
 
     All recordings are tested together first. Where they share no fault, each is tested alone: one
     of several may have been recorded after a camera was moved. Nothing is proved by a model whose
-    change with the actuation is not known.
+    change with the actuation is not known. Raises InputError for recordings of another arm.
     """
+    check_fits(model.spec, list(recordings), sized=False)
     if not has_slope(model):
         return None
     measured = [r for r in recordings if np.isfinite(r.key_points_mm).any()]

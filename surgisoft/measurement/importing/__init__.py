@@ -5,6 +5,7 @@ from surgisoft.measurement.importing.convert import (
     import_files,
     import_lerobot,
     import_log,
+    import_recordings,
 )
 from surgisoft.measurement.importing.draft import draft_map
 from surgisoft.measurement.importing.raw import RawTable, Reader
@@ -23,5 +24,6 @@ __all__ = [
     "import_files",
     "import_lerobot",
     "import_log",
+    "import_recordings",
     "load_map",
 ]

@@ -7,7 +7,7 @@ become the runs of one recording or a recording each.
 
 import fnmatch
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -35,10 +35,12 @@ from surgisoft.measurement.importing.spec import (
     ActuationMap,
     ContextSource,
     ImportMap,
+    load_map,
 )
 from surgisoft.measurement.importing.timing import timing_notes
 from surgisoft.measurement.recordings import Recording
-from surgisoft.measurement.recordings.lerobot import load_lerobot
+from surgisoft.measurement.recordings.lerobot import is_dataset, load_lerobot
+from surgisoft.measurement.recordings.log import SUFFIX as LOG_SUFFIX
 from surgisoft.measurement.recordings.log import read_log
 from surgisoft.measurement.recordings.quality import without_frozen, without_spikes
 from surgisoft.measurement.units import factor
@@ -67,6 +69,35 @@ def import_files(paths: Sequence[Path], spec: ImportMap, name: str | None) -> li
         _check_names(named)
         return [_finished(part, spec) for part in named]
     return [_finished(_as_runs(parts, spec, name), spec)]
+
+
+def import_recordings(
+    raw: Iterable[str | Path] | str | Path,
+    map_file: str | Path | None = None,
+    name: str | None = None,
+) -> list[Imported]:
+    """The recordings in a laboratory's files, not yet saved, with notes on what was done.
+
+    Key points are in mm in the arm base frame, times in s. Raises InputError where files and map do
+    not fit each other.
+
+    raw: files or folders. map_file: a map (docs/recordings.md), or `motive`; None: the files are
+    logs of interrupted recordings (.jsonl) or LeRobotDatasets with a recording's names, which need
+    none. name: the files are the runs of one recording of this name; None: each set of files is a
+    recording, named after its main file.
+    """
+    paths = [Path(path) for path in ([raw] if isinstance(raw, str | Path) else raw)]
+    if map_file is not None:
+        return import_files(paths, load_map(str(map_file)), name)
+    if paths and all(path.suffix == LOG_SUFFIX for path in paths):
+        return [import_log(path, name or path.stem) for path in paths]
+    if paths and all(is_dataset(path) for path in paths):
+        return [import_lerobot(path, name or path.name) for path in paths]
+    first = f" {paths[0]}" if paths else ""
+    raise InputError(
+        "--map is missing: a map file states columns, units and frames; "
+        f"'surgisoft import{first} --draft map.toml' writes one to start from"
+    )
 
 
 def import_log(path: Path, name: str) -> Imported:

@@ -1,0 +1,29 @@
+"""Export an arm model for other programs, compared with the model on recordings."""
+
+from pathlib import Path
+
+from surgisoft.measurement.fitting import Recordings
+from surgisoft.measurement.histories import check_fits, history_of
+from surgisoft.measurement.recordings import load_recordings
+from surgisoft.surrogate.checkpoint import load_model
+from surgisoft.surrogate.export import export_arm as export_histories
+from surgisoft.surrogate.model import ArmModel
+
+
+def export_arm(
+    model: ArmModel | str | Path, folder: str | Path, recordings: Recordings = ()
+) -> list[Path]:
+    """Write an arm model as ONNX and TorchScript into a new folder; returns the files.
+
+    The files map actuation in the model's unit to key points in mm in the arm base frame;
+    `arm.json` states every name, order, unit and range. Raises InputError where the folder is in
+    use, where the model cannot be written as a graph, for recordings of another arm, and where a
+    file differs from the model by more than `surgisoft.surrogate.export.TOLERANCE_MM`.
+
+    model: a model or its folder. recordings: over whose rows files and model are compared too
+    (`surgisoft.surrogate.export.differences`).
+    """
+    arm, measured = load_model(model), load_recordings(recordings)
+    check_fits(arm.spec, measured)
+    histories = {each.name: history_of([each], arm.spec.actuation) for each in measured}
+    return export_histories(arm, folder, histories)

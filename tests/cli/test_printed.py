@@ -107,7 +107,7 @@ def test_evaluate_prints_a_column_for_each_policy(capsys, monkeypatch):
     )
     found = result(
         task="track_circle", results=[scripted, learned], success_rule="within 1 mm",
-        measured_arms=("arm",), logs={},
+        measured_arms=("arm",), logs={}, request=SimpleNamespace(seed=4),
     )  # fmt: skip
     out = printed(
         capsys, monkeypatch, "surgisoft.agents.session.evaluate", found,
@@ -468,9 +468,9 @@ def test_a_group_without_a_command_prints_its_help(capsys):
 
 
 def test_what_is_claimed_is_written_with_its_page(bench, tmp_path, capsys, monkeypatch):
-    saved = []
+    saved, save = [], "surgisoft.surrogate.checkpoint.save_model"
+    monkeypatch.setattr(save, lambda made, new, *_: saved.append(str(new)))
     for module in ("surgisoft.cli.amend", "surgisoft.cli.improve"):
-        monkeypatch.setattr(f"{module}.save_amended", lambda made, new, *_: saved.append(str(new)))
         view = f"{module}.write_before_and_after"
         monkeypatch.setattr(view, lambda made, tables, name, file: file)
     monkeypatch.setattr("surgisoft.diagnosis.compare.tables_of", lambda *_: {})
@@ -511,8 +511,7 @@ def test_an_import_names_what_looks_wrong(bench, tmp_path, capsys, monkeypatch):
 
     some = load_recording(bench / "bench.parquet")
     parts = [SimpleNamespace(recording=some, notes=("the clock was set",))]
-    monkeypatch.setattr("surgisoft.measurement.importing.load_map", lambda path: {})
-    monkeypatch.setattr("surgisoft.measurement.importing.import_files", lambda *_: parts)
+    monkeypatch.setattr("surgisoft.measurement.importing.import_recordings", lambda *_: parts)
     wrong = SimpleNamespace(sample=4, text="a jump of 30 mm")
     monkeypatch.setattr("surgisoft.measurement.recordings.find_warnings", lambda rec: [wrong])
     faults = "surgisoft.diagnosis.setup.find_setup_faults"

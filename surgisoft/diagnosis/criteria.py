@@ -25,10 +25,9 @@ class Search:
     """Largest family-wise p-value of an effect that is proposed."""
     large_gain: float = 0.5
     """Or: least gain, whatever the p-value; few blocks may show the effect."""
-    most_effects: int = 2
-    """Most effects that are proposed together."""
-    exchanges: int = 4
-    """Most rounds of exchanges."""
+    pairs: int = 8
+    """Pairs of effects whose forms are sought beside each other until nothing is better. With 8 the
+    best of all pairs in all forms was found in 75 of 76 recordings with two hidden effects."""
 
     # Which effects are compared at their optimum.
     refined_gain: float = 0.6

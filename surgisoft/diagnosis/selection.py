@@ -1,14 +1,14 @@
 """Model selection: which effects explain what the model leaves, alone and together.
 
 Every effect is scored by the held-out error that remains with it, the model discrepancy always
-fitted beside it (`cross_validation`). Forward selection with exchanges then proposes the best
-single effect and the best two, generously: whether any of them is missing is left to the fitted
-decision (`decision`).
+fitted beside it (`cross_validation`). The best single effect and the best two of all pairs are
+proposed, generously: whether any of them is missing is left to the fitted decision (`decision`).
 """
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 
@@ -227,8 +227,8 @@ class ModelSelection:
         outweighing the others."""
         return np.log((before + self.floor) / (after + self.floor))
 
-    def scores(self, base: tuple[int, ...] = (), without: tuple[str, ...] = ()):
-        """Every effect on top of a base, the best first."""
+    def every_score(self, base: tuple[int, ...] = (), without: tuple[str, ...] = ()) -> list[Score]:
+        """Every form of every effect on top of a base, plausible or not, in no order."""
         before = self.losses(base)
         choices = [w for name, some in self.options.items() if name not in without for w in some]
         after = [self.losses(base + option.chosen) for option in choices]
@@ -239,17 +239,20 @@ class ModelSelection:
             self.problem.by_motion(gains), [option.effect for option in choices]
         )
         explainable = self.explainable(before, after)
-        best: dict[str, Score] = {}
-        scores = [
-            SEARCH.priced(g.mean(), len(w.chosen)) for g, w in zip(gains, choices, strict=True)
+        return [
+            Score(w.effect, w, losses, gain, chance, (before.sum() - losses.sum()) / explainable)
+            for w, losses, gain, chance in zip(choices, after, gains, chances, strict=True)
         ]
-        for i in np.argsort(-np.array(scores), kind="stable"):
-            option, losses = choices[i], after[i]
-            if option.effect not in best and self.plausible(option, base):
-                gain = (before.sum() - losses.sum()) / explainable
-                best[option.effect] = Score(
-                    option.effect, option, losses, gains[i], chances[i], gain
-                )
+
+    def scores(self, base: tuple[int, ...] = (), without: tuple[str, ...] = ()) -> list[Score]:
+        """Every effect on top of a base in its best plausible form, the best first."""
+        best: dict[str, Score] = {}
+        every = self.every_score(base, without)
+        scores = np.array([each.score for each in every])
+        for i in np.argsort(-scores, kind="stable"):
+            found = every[i]
+            if found.effect not in best and self.plausible(found.option, base):
+                best[found.effect] = found
         return sorted(best.values(), key=lambda score: -score.score)
 
     def plausible(self, option: Option, base: tuple[int, ...] = ()) -> bool:
@@ -495,22 +498,16 @@ class Proposal:
 def propose(selection: ModelSelection, first: list[Score]) -> tuple[Proposal, ...]:
     """The best single effect and the best two; whether any is missing is left open.
 
-    Forward selection adds the effect that explains most, which beside a second one may be the wrong
-    one: after every step each effect gives way to the one that does best beside the others
-    (stepwise exchange: Miller 2002, "Subset selection in regression", sec. 3.5). It ends where the
-    best further effect is within chance or explains next to nothing.
+    The two are sought among all pairs, since the best single effect need not be one of them: where
+    two act, a third may explain most of both. None where even the best is within chance.
     """
-    answer: list[Proposal] = []
-    named: list[Score] = []
-    following = [score for score in first if not selection.in_fit(score.effect)]
-    while following and len(named) < SEARCH.most_effects and _worth_a_look(following[0]):
-        found = exchanged(selection, [*named, following[0]])
-        before = frozenset(score.effect for score in named)
-        if answer and frozenset(score.effect for score in found) == before:
-            break
-        named = found
-        answer.append(Proposal(selection, tuple(named)))
-        following = selection.scores(chosen_by(named), tuple(s.effect for s in named))
+    some = [score for score in first if not selection.in_fit(score.effect)]
+    if not some or not _worth_a_look(some[0]):
+        return ()
+    answer = [Proposal(selection, (some[0],))]
+    pair = best_pair(selection, some)
+    if pair:
+        answer.append(Proposal(selection, pair))
     return tuple(answer)
 
 
@@ -529,37 +526,65 @@ def _instead(selection: ModelSelection, named: Sequence[Score]) -> tuple[Score |
     return tuple(answer)
 
 
-def exchanged(selection: ModelSelection, named: list[Score]) -> list[Score]:
-    """The effects after exchanges, the one that would be missed most first."""
-    for _ in range(SEARCH.exchanges):
-        changed = False
-        for place in range(len(named)):
-            others = named[:place] + named[place + 1 :]
-            if not others:
-                break
-            best = selection.scores(chosen_by(others), tuple(s.effect for s in others))[0]
-            changed = changed or best.effect != named[place].effect
-            named = [*named[:place], best, *named[place + 1 :]]
-        if not changed:
-            break
-    return _in_order(selection, named)
+def best_pair(selection: ModelSelection, first: Sequence[Score]) -> tuple[Score, ...]:
+    """The best two of some effects, the one that would be missed most first; none where no two are.
+
+    Pairs of forms are ranked by `_together`. Every form of one effect is tried beside the best form
+    of the other one, and in the `SEARCH.pairs` best pairs of effects again beside what was found,
+    until nothing is better. The first pair of forms is taken in which both effects are plausible
+    beside each other.
+    """
+    null = selection.losses()
+    tried: dict[tuple[Option, Option], float] = {}
+
+    def worth(a: Option, b: Option) -> float:
+        if (a, b) not in tried:
+            tried[a, b] = _together(selection, null, a.chosen + b.chosen)
+        return tried[a, b]
+
+    def improved(a: Option, b: Option) -> tuple[Option, Option]:
+        """The better of exchanging one form beside the other one."""
+        one = max(selection.options[a.effect], key=lambda form: worth(form, b))
+        two = max(selection.options[b.effect], key=lambda form: worth(a, form))
+        return max(((one, b), (a, two)), key=lambda pair: worth(*pair))
+
+    best = [
+        max(
+            selection.options[score.effect],
+            key=lambda form: _together(selection, null, form.chosen),
+        )
+        for score in first
+    ]
+    found = [improved(a, b) for a, b in combinations(best, 2)]
+    for pair in sorted(found, key=lambda pair: -worth(*pair))[: SEARCH.pairs]:
+        while (better := improved(*pair)) != pair:
+            pair = better
+    for a, b in sorted(tried, key=lambda pair: -tried[pair]):
+        if selection.plausible(a, b.chosen) and selection.plausible(b, a.chosen):
+            return _in_order(selection, a, b)
+    return ()
 
 
-def _in_order(selection: ModelSelection, named: list[Score]) -> list[Score]:
-    """The named effects, most important first, each on top of those before it."""
-    if len(named) < 2:
-        return named
+def _together(selection: ModelSelection, null: np.ndarray, chosen: tuple[int, ...]) -> float:
+    """How well sensitivities explain: mean log gain of a block plus log gain of their sum.
 
-    def missed(score: Score) -> float:
-        rest = [other for other in named if other is not score]
-        return -float(selection.losses(chosen_by(rest)).sum())
+    Few blocks that fall by much and many that fall by little both count. The noise is added to
+    both, and amplitudes have their price.
+    """
+    losses, floor = selection.losses(chosen), selection.floor.sum()
+    whole = float(np.log((null.sum() + floor) / (losses.sum() + floor)))
+    return SEARCH.priced(selection.log_ratio(null, losses).mean() + whole, len(chosen))
 
-    answer: list[Score] = []
-    for score in sorted(named, key=missed):
-        found = selection.scores(chosen_by(answer), tuple(s.effect for s in answer))
-        again = next((s for s in found if s.effect == score.effect), score)
-        answer.append(again)
-    return answer
+
+def _in_order(selection: ModelSelection, *some: Option) -> tuple[Score, ...]:
+    """Two effects in given forms, the one that would be missed most first, each on top of those
+    before it."""
+    one, two = sorted(some, key=lambda option: float(selection.losses(option.chosen).sum()))
+    answer = []
+    for option, base, without in ((one, (), ()), (two, one.chosen, (one.effect,))):
+        every = selection.every_score(base, without)
+        answer.append(next(score for score in every if score.option is option))
+    return tuple(answer)
 
 
 # Identification ------------------------------------------------------------------------------

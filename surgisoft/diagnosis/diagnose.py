@@ -259,7 +259,7 @@ def diagnose(
     """Name the effects that a model is missing on recordings of its own arm.
 
     Returns one of the verdicts of docs/diagnosis.md with its confidence, the evidence for it, and
-    every effect with its score: cross-validated forward selection among first-order sensitivities,
+    every effect with its score: cross-validated selection among first-order sensitivities,
     beside a Gaussian-process model discrepancy (Kennedy & O'Hagan 2001), and a fitted decision.
     Errors are in mm, parameters in the units of their effect. Raises InputError where the
     recordings are too short or do not fit the model.

@@ -1,7 +1,9 @@
-"""Forward, exchanged, back: on a hand-made table of losses, and on a robot that hides two."""
+"""Proposals from a hand-made table of losses, and from a robot that hides two effects."""
 
 from dataclasses import dataclass, replace
+from itertools import combinations
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -21,17 +23,27 @@ LOSS = {"": 100, "0": 40, "1": 55, "2": 50, "01": 20, "02": 18, "12": 2, "012": 
 """Loss of every set of effects: the blend is best alone, left and right are the truth."""
 
 
+def forms_of(names, count):
+    """So many forms of every effect, numbered through."""
+    return {
+        name: [Option(name, (count * i + k,), count * i + k, 1) for k in range(count)]
+        for i, name in enumerate(names)
+    }
+
+
 @dataclass
 class Table:
     """A model selection whose losses are those of LOSS, spread over blocks."""
 
     floor = np.full(40, 1.0 / 40)
     whole_size = 3.0
+    options: ClassVar = forms_of(NAMES, 1)
+    loss: ClassVar = LOSS
 
     def losses(self, chosen=()):
         rng = np.random.default_rng(0)
         share = rng.uniform(0.9, 1.1, 40)
-        return LOSS["".join(str(p) for p in sorted(set(chosen)))] * share / 40
+        return self.loss["".join(str(p) for p in sorted(set(chosen)))] * share / 40
 
     def excess(self, losses):
         return float(losses.sum() - 1.0)
@@ -42,18 +54,26 @@ class Table:
     def size(self, losses):
         return 3.0
 
-    def scores(self, base=(), without=()):
+    def log_ratio(self, before, after):
+        return np.log((before + self.floor) / (after + self.floor))
+
+    def plausible(self, option, base=()):
+        return True
+
+    def every_score(self, base=(), without=()):
         answer = []
-        for place, name in enumerate(NAMES):
-            if name in without:
-                continue
-            after = self.losses((*base, place))
-            gain = np.log((self.losses(base) + 0.01) / (after + 0.01))
-            gain = gain + np.random.default_rng(place).normal(0, 1e-3, 40)
-            share = (self.losses(base).sum() - after.sum()) / self.excess(self.losses(base))
-            chance = float(sign_flip_p_values(gain[None])[0])
-            answer.append(Score(name, Option(name, (place,), 0, 1), after, gain, chance, share))
-        return sorted(answer, key=lambda s: -s.score)
+        for name, options in self.options.items():
+            for option in options if name not in without else []:
+                after = self.losses((*base, *option.chosen))
+                gain = np.log((self.losses(base) + 0.01) / (after + 0.01))
+                gain = gain + np.random.default_rng(option.chosen[0]).normal(0, 1e-3, 40)
+                share = (self.losses(base).sum() - after.sum()) / self.excess(self.losses(base))
+                chance = float(sign_flip_p_values(gain[None])[0])
+                answer.append(Score(name, option, after, gain, chance, share))
+        return answer
+
+    def scores(self, base=(), without=()):
+        return sorted(self.every_score(base, without), key=lambda s: -s.score)
 
 
 @pytest.fixture
@@ -74,6 +94,49 @@ def test_the_best_alone_gives_way_to_the_two_that_are_best_together(table):
     assert [score.effect for score in two.instead] == ["blend", "blend"]
 
 
+def test_two_that_are_not_plausible_beside_each_other_are_not_proposed(table, monkeypatch):
+    """Left and right explain most, but right would have an impossible parameter beside left."""
+    monkeypatch.setattr(
+        table,
+        "plausible",
+        lambda option, base=(): not (option.effect == "right" and base == (1,)),
+        raising=False,
+    )
+    assert selection.propose(table, table.scores())[1].effects == ("blend", "right")
+    monkeypatch.setattr(table, "plausible", lambda option, base=(): not base)
+    assert [p.effects for p in selection.propose(table, table.scores())] == [("blend",)]
+
+
+def test_the_best_two_of_all_pairs_are_proposed_in_their_best_forms(table, monkeypatch):
+    """Random losses of three effects with three forms each that two divide as products: the
+    proposal leaves the least of all 27 pairs of forms, and the effect missed most comes first."""
+    monkeypatch.setattr(Table, "options", forms_of(NAMES, 3))
+    pairs = list(combinations(range(9), 2))
+    for seed in range(20):
+        alone = np.random.default_rng(seed).uniform(0.2, 0.9, 9)
+        loss = {"": 100.0} | {str(i): 100.0 * alone[i] for i in range(9)}
+        loss |= {f"{i}{j}": 100.0 * alone[i] * alone[j] for i, j in pairs}
+        monkeypatch.setattr(Table, "loss", loss)
+        apart = [(i, j) for i, j in pairs if i // 3 != j // 3]
+        least = min(apart, key=lambda pair: loss[f"{pair[0]}{pair[1]}"])
+        first = {score.effect: score for score in reversed(table.scores())}
+        found = selection.best_pair(table, list(first.values()))
+        assert {score.option.candidate for score in found} == set(least)
+        assert alone[found[0].option.alone] <= alone[found[1].option.alone]
+
+
+def test_forms_are_exchanged_until_no_other_form_is_better(table, monkeypatch):
+    """The best pair of forms is four exchanges away from the two that are best alone."""
+    monkeypatch.setattr(Table, "options", forms_of(NAMES[:2], 3))
+    loss = {"": 100} | {str(i): 90 for i in range(6)} | {"0": 80, "3": 80}
+    loss |= {f"{i}{j}": 70 for i in range(3) for j in range(3, 6)}
+    loss |= {"03": 60, "04": 50, "14": 40, "15": 30, "25": 10}
+    monkeypatch.setattr(Table, "loss", loss)
+    first = {score.effect: score for score in reversed(table.scores())}
+    found = selection.best_pair(table, list(first.values()))
+    assert {score.option.candidate for score in found} == {2, 5}
+
+
 def test_a_proposal_is_tested_when_its_tests_are_read(table, monkeypatch):
     """`compare` asks what the effects leave, and nothing else."""
     asked = []
@@ -86,7 +149,8 @@ def test_a_proposal_is_tested_when_its_tests_are_read(table, monkeypatch):
 
 def test_an_effect_of_the_fit_is_not_proposed_for_what_the_fit_left(table, monkeypatch):
     monkeypatch.setattr(table, "in_fit", lambda effect: effect == "blend", raising=False)
-    assert selection.propose(table, table.scores())[0].effects == ("right",)
+    one, two = selection.propose(table, table.scores())
+    assert (one.effects, two.effects) == (("right",), ("right", "left"))
     monkeypatch.setattr(table, "in_fit", lambda effect: True)
     assert selection.propose(table, table.scores()) == ()
 

@@ -33,8 +33,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from surgisoft.diagnosis.criteria import CLAIM, WORTH, Claim, Worth
-from surgisoft.diagnosis.evidence import EffectEvidence, Evidence, ProposalEvidence
+from surgisoft.diagnosis.criteria import CLAIM, SEARCH, WORTH, Claim, Worth
+from surgisoft.diagnosis.evidence import (
+    EffectEvidence,
+    Evidence,
+    ProposalEvidence,
+    normal_quantile,
+)
 from surgisoft.errors import InputError
 from surgisoft.files import read_json
 
@@ -53,7 +58,7 @@ Reason = Literal["network", "learned", "repeatability", "few_data", "schedule"]
 what is missing; how well recordings of an unchanged arm agree is not known well enough; there are
 too few motions; the schedule does not tell effects apart."""
 
-SCHEMA = 4
+SCHEMA = 5
 """Version of the asset's format and of the features: weights belong to the features that they were
 fitted with, so an asset of another version is fitted again."""
 ASSET = Path(__file__).parents[1] / "assets" / "decision" / "decision.json"
@@ -114,9 +119,19 @@ def _best(evidence: Evidence) -> EffectEvidence | None:
     return evidence.effects[0] if evidence.effects else None
 
 
+def _beyond_chance(evidence: Evidence) -> list[ProposalEvidence]:
+    """The proposals but for two effects of which the second is within chance.
+
+    Two effects are always proposed where one is, and explain a little more than one, whatever is
+    missing.
+    """
+    least = normal_quantile(SEARCH.p_value)
+    return [each for each in evidence.proposals if len(each.effects) == 1 or each.last_z >= least]
+
+
 def _most(evidence: Evidence, name: str, start: float) -> float:
-    """Largest value of a number of the proposals."""
-    return max([start, *(float(getattr(each, name)) for each in evidence.proposals)])
+    """Largest value of a number of the proposals that are beyond chance."""
+    return max([start, *(float(getattr(each, name)) for each in _beyond_chance(evidence))])
 
 
 def _explained(evidence: Evidence) -> float:
@@ -131,13 +146,13 @@ def _unexplained(evidence: Evidence) -> float:
 
 def _left_size(evidence: Evidence) -> float:
     """Error above the floor that the best proposal leaves, in units of the discrepancy."""
-    some = [each.left_size for each in evidence.proposals]
+    some = [each.left_size for each in _beyond_chance(evidence)]
     return min([evidence.size_beside_discrepancy, *some])
 
 
 def _free_better(evidence: Evidence) -> float:
     """Log gain of the free black box over the best proposal."""
-    return min([evidence.free_log_gain, *(each.left_log_free for each in evidence.proposals)])
+    return min([evidence.free_log_gain, *(each.left_log_free for each in _beyond_chance(evidence))])
 
 
 def _break(evidence: Evidence) -> float:
@@ -184,7 +199,7 @@ def _most_lack_of_fit(evidence: Evidence) -> float:
     On a log scale, because a formula that is right leaves its relaxed form next to nothing to
     explain: a lack of fit of 0.2 is ten times what it may be, and not a fifth of the worst.
     """
-    some = [lack_of_fit(each.form_gain, each.form_log_gain) for each in evidence.proposals]
+    some = [lack_of_fit(each.form_gain, each.form_log_gain) for each in _beyond_chance(evidence)]
     return math.log1p(max(some, default=0.0) / FORM_SHARE) / 3.0
 
 

@@ -72,8 +72,9 @@ less than that."""
 NAMED_LOST = 0.03
 """Most known effects, as a share of them, that fewer wrong names may cost: that are named where a
 wrong name costs what a right one gains, and no more with the costs that are chosen. Stated."""
-UNKNOWN_COSTS = (0.25, 0.5, 1.0, 2.0)
-"""Costs of a wrong "unknown" that are tried, in units of what a right one is worth."""
+UNKNOWN_COSTS = (0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
+"""Costs of a wrong "unknown" that are tried, in units of what a right one is worth, a
+factor of about 1.4 apart."""
 MOST_CALLED_UNKNOWN = 0.05
 """Most known effects and unchanged arms, as a share of each source, that may be called unknown."""
 

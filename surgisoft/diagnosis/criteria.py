@@ -73,7 +73,8 @@ class Worth:
     with the next one: with the fewest wrong names, and at most 3 % of the effects unnamed that
     these two costs would name (`NAMED_LOST` in `benchmarks/decision/fit.py`)."""
     wrong_name: float = -1.0
-    """An effect is named, alone or in a set, and another one of the list is missing."""
+    """An effect is named, alone or in a set, and another one of the list is missing; or two are
+    named together, and neither of them is missing but another one of the list."""
     right_set: float = 0.7
     """The missing effect is one of two that are named as a set. A wrong set costs this share of a
     wrong name: its reader makes an experiment, and does not change the model."""

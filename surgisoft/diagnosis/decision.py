@@ -909,8 +909,10 @@ def statements(
         value = named(chance, worth.right_set, worth.right_set)
         add("ambiguous", (names[0], names[1]), chance, value)
     if chances.two:
-        half = max(known - pair, 0.0) * worth.half_pair
-        add("several", chances.two, pair, pair + half + (1.0 - known) * worth.needless_name)
+        some = max(sum(chances.effects.get(name, 0.0) for name in chances.two), pair)
+        half, none = some - pair, max(known - some, 0.0)
+        value = pair + half * worth.half_pair + none * worth.wrong_name
+        add("several", chances.two, pair, value + (1.0 - known) * worth.needless_name)
     quiet, unknown = chances.nothing + chances.network, chances.unknown
     if claimable(evidence, claim):
         add("nothing_missing", (), quiet, quiet + (1.0 - quiet) * worth.wrong_nothing)

@@ -27,6 +27,7 @@ from surgisoft.diagnosis.decision import (
     load_decision,
     probabilities,
     reason_of,
+    statements,
 )
 from surgisoft.diagnosis.evidence import EffectEvidence, Evidence, ProposalEvidence
 from surgisoft.errors import InputError
@@ -495,3 +496,13 @@ def test_a_result_without_worth_is_not_told():
     sure = decide(GOOD, given_odds(missing=2.5, known=2.5, first=CLEAR), Worth(needless_name=-9.0))
     assert sure.kind == "cannot_tell"
     assert decide(GOOD, given_odds(missing=2.5, known=2.5, first=CLEAR)).kind == "identified"
+
+
+def test_two_wrong_names_cost_what_one_costs():
+    """Of 90 % that an effect of the list is missing, 40 are both, 20 one of the two, 30 neither."""
+    effects = {"creep": 0.4, "payload": 0.2, "contact": 0.3}
+    chances = Probabilities(0.1, 0.0, 0.0, effects, 0.4, ("creep", "payload"))
+    worth = Worth(needless_name=-1.0, wrong_name=-2.0, half_pair=0.0)
+    found = {one.kind: one for one in statements(GOOD, chances, worth)}
+    assert found["several"].probability == 0.4
+    assert found["several"].worth == pytest.approx(0.4 - 2.0 * 0.3 - 1.0 * 0.1)

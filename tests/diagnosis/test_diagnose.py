@@ -12,7 +12,8 @@ from surgisoft.diagnosis.candidates import candidates
 from surgisoft.diagnosis.diagnose import amplitudes_that_vary, diagnose, knock, would_explain
 from surgisoft.diagnosis.inputs import identification_problem
 from surgisoft.diagnosis.residuals import Floor, held_out_rows, residual_table
-from surgisoft.diagnosis.testability import DETECTED, testable
+from surgisoft.diagnosis.testability import DETECTED
+from surgisoft.diagnosis.testability import testable as split_by_testability
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.rig import VirtualRig
@@ -265,10 +266,10 @@ def test_an_effect_that_shows_below_its_plausible_range_is_a_candidate():
 
     some = [each for each in candidates(problem, ["contact"]) if share(each) < LEAST_SHARE]
     assert some
-    assert testable(problem, some, ["contact"]) == (some, ())
+    assert split_by_testability(problem, some, ["contact"]) == (some, ())
     # With much more noise no support of any share would be seen.
     table = replace(problem.table, noise_mm=1e4 * problem.noise_mm)
-    kept, absent = testable(replace(problem, table=table), some, ["contact"])
+    kept, absent = split_by_testability(replace(problem, table=table), some, ["contact"])
     assert not kept
     assert [each.cause for each in absent] == ["below_noise"]
 

@@ -23,7 +23,8 @@ def export_arm(
     model: a model or its folder. recordings: over whose rows files and model are compared too
     (`surgisoft.surrogate.export.differences`).
     """
-    arm, measured = load_model(model), load_recordings(recordings)
+    none = isinstance(recordings, list | tuple) and not recordings
+    arm, measured = load_model(model), [] if none else load_recordings(recordings)
     check_fits(arm.spec, measured)
     histories = {each.name: history_of([each], arm.spec.actuation) for each in measured}
     return export_histories(arm, folder, histories)

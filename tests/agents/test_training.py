@@ -454,7 +454,10 @@ def test_the_better_checkpoint_is_kept():
 
 def test_the_seed_that_selects_judges_nothing():
     """No default and no small seed, as users give them, is that of the selection."""
-    used = {TrainingRequest("track_circle").seed, EvaluationRequest(("random",), "x").seed}
+    used = {
+        TrainingRequest("track_circle").seed,
+        EvaluationRequest(("random",), "x").under_rules().seed,
+    }
     assert used == {0}
     assert SEED > 10_000
 

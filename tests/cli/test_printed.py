@@ -573,7 +573,7 @@ def test_no_mounts_are_one_line_with_what_was_repaired(tmp_path, capsys, monkeyp
     def none(*_):
         raise NoMounts("the laser reaches 40 % of the ring", ("organ.stl: unit mm",))
 
-    monkeypatch.setattr("surgisoft.scene.author.author", none)
+    monkeypatch.setattr("surgisoft.tasks.world.authoring.author", none)
     organ = tmp_path / "organ.stl"
     organ.touch()
     new = tmp_path / "scene"

@@ -209,9 +209,10 @@ def test_success_is_one_rule_in_experiment_and_evaluate(whole, tmp_path, monkeyp
     assert rule in (folder / "report.html").read_text()
     asked = []
 
-    def stop(policies, task, **fields):
-        asked.append((task, fields["config"]))
-        assert (fields["seed"], fields["rules"].spec) == (spec.seed, spec)
+    def stop(policies, task, progress=None, **fields):
+        request = session.EvaluationRequest(tuple(policies), task, **fields).under_rules()
+        asked.append((request.task, request.config))
+        assert (request.seed, request.rules.spec) == (spec.seed, spec)
         raise InputError("stop here")
 
     monkeypatch.setattr(session, "evaluate", stop)

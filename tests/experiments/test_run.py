@@ -209,7 +209,7 @@ def test_success_is_one_rule_in_experiment_and_evaluate(whole, tmp_path, monkeyp
     assert rule in (folder / "report.html").read_text()
     asked = []
 
-    def stop(policies, task, progress=None, **fields):
+    def stop(policies, task, progress=None, on_warning=None, **fields):
         request = session.EvaluationRequest(tuple(policies), task, **fields).under_rules()
         asked.append((request.task, request.config))
         assert (request.seed, request.rules.spec) == (spec.seed, spec)

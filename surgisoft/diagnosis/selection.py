@@ -527,7 +527,7 @@ def _instead(selection: ModelSelection, named: Sequence[Score]) -> tuple[Score |
 
 
 def best_pair(selection: ModelSelection, first: Sequence[Score]) -> tuple[Score, ...]:
-    """The best two of some effects, the one that would be missed most first; none where no two are.
+    """The best two of some effects, the one that would be missed most first; empty without any two.
 
     Pairs of forms are ranked by `_together`. Every form of one effect is tried beside the best form
     of the other one, and in the `SEARCH.pairs` best pairs of effects again beside what was found,
@@ -566,7 +566,7 @@ def best_pair(selection: ModelSelection, first: Sequence[Score]) -> tuple[Score,
 
 
 def _together(selection: ModelSelection, null: np.ndarray, chosen: tuple[int, ...]) -> float:
-    """How well sensitivities explain: mean log gain of a block plus log gain of their sum.
+    """How well sensitivities explain: mean log gain of the blocks plus log gain of the whole error.
 
     Few blocks that fall by much and many that fall by little both count. The noise is added to
     both, and amplitudes have their price.

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -29,6 +30,8 @@ APPROACH_STEPS = 60
 """Steps of the scripted expert before images are drawn; the beams burn then."""
 REPLAYED = 24
 """Pictures that the replay's renderer draws in a round."""
+PIXELS = (64, 128, 256)
+"""Widths and heights of the images, pixels."""
 
 
 def best(draw, count: int) -> tuple[float, float]:
@@ -43,15 +46,18 @@ def best(draw, count: int) -> tuple[float, float]:
     return count / cpu, count / wall
 
 
-def main() -> None:
-    """Print one line for each kind and size of image."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print one line for each kind and size of image.
+
+    arguments: of the command line; default: those of the process.
+    """
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("--envs", type=int, default=256, help="environments in the batch")
-    count = options.parse_args().envs
+    count = options.parse_args(arguments).envs
     env = surgisoft.batched_env("circle_ablation", count)
     for _ in range(APPROACH_STEPS):
-        env.step(env.task.script(env.task_state))
-    state, engine = env.task_state.world, env.task.world.scene
+        env.step(env.task.script(env.state))
+    state, engine = env.state.world, env.task.world.scene
     eye = state.arms["endoscope"]
     poses = frames.pose_from_z(eye.tip_mm.double(), eye.tip_direction.double()).numpy()
     radii = engine.geometry.radii_mm
@@ -59,7 +65,7 @@ def main() -> None:
     faces = sum(len(body.mesh.faces) for body in engine.geometry.bodies)
     print(f"{count} environments, {faces} faces, {burning:.0%} of the beams burn")
     print(f"{torch.get_num_threads()} thread(s); images/s of processor time and on the clock")
-    for pixels in (64, 128, 256):
+    for pixels in PIXELS:
         slow = Renderer(engine.geometry.bodies, engine.camera, pixels, pixels)
 
         def replayed(slow=slow):

@@ -10,7 +10,7 @@ import torch
 from surgisoft.diagnosis.candidates import with_effect
 from surgisoft.diagnosis.estimation import network_error
 from surgisoft.diagnosis.estimation.effects import fit_effects
-from surgisoft.diagnosis.estimation.intervals import DRAWS, Fitted, intervals
+from surgisoft.diagnosis.estimation.intervals import DRAWS, Fitted, Parameter, intervals
 from surgisoft.diagnosis.estimation.least_squares import (
     Fit,
     Prediction,
@@ -329,3 +329,16 @@ def test_amplitudes_of_an_effect_that_is_not_there_are_no_surprise():
             layer.weight.add_(0.01 * layer.weight.std() * change)
     absent = problem_of(off, [measured_on(bare_arm())], part="training")
     assert fit_effects(absent, ["gain_mismatch"]).p_value > 0.05
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "known"),
+    [(0.02, 6.6e6, False), (0.02, 1500.0, True), (300.0, 6.6e6, True), (80.0, 95.0, True)],
+)
+def test_a_value_of_which_nothing_is_learned_is_said_to_be_not_identifiable(low, high, known):
+    """A recording of minutes says nothing of a time constant whose interval covers its range."""
+    tau = Parameter("creep", "tau_s", 90.0, low, high, "s", True, (0.1, 2000.0), "the library's")
+    assert tau.identifiable is known is tau.to_json()["identifiable"]
+    assert tau.interval_text.startswith("not identifiable from these recordings") is not known
+    chambers = replace(tau, value=[90.0, 90.0], low=[low, 80.0], high=[high, 95.0])
+    assert chambers.identifiable

@@ -79,17 +79,40 @@ class Parameter:
         return self.plausible or bool(np.all((low <= most) & (high >= least)))
 
     @property
+    def identifiable(self) -> bool:
+        """Whether the recordings tell more of the value than its plausible range does.
+
+        They do not where the 95 % interval covers that range for every value: practical
+        non-identifiability (Raue et al. 2009), such as of a time constant of hours in a recording
+        of minutes.
+        """
+        least, most = self.plausible_range
+        low, high = np.asarray(self.low, float), np.asarray(self.high, float)
+        return not bool(np.all((low <= least) & (high >= most)))
+
+    @property
     def interval_text(self) -> str:
         """The interval in short; empty where the value was given or there are too many."""
         if np.size(self.value) > MOST_VALUES or self.low == self.high:
             return ""
-        return f"{values_text(self.low)} to {values_text(self.high)}"
+        text = f"{values_text(self.low)} to {values_text(self.high)}"
+        if self.identifiable:
+            return text
+        least, most = self.plausible_range
+        return (
+            "not identifiable from these recordings: the 95 % interval covers all plausible "
+            f"values, {least:.3g} to {most:.3g}"
+        )
 
     def to_json(self) -> dict:
         """Plain values, the interval as `ci95`."""
         values = asdict(self)
         low, high = values.pop("low"), values.pop("high")
-        return values | {"ci95": [low, high], "plausible_range": list(self.plausible_range)}
+        return values | {
+            "ci95": [low, high],
+            "identifiable": self.identifiable,
+            "plausible_range": list(self.plausible_range),
+        }
 
 
 def values_text(value: float | list) -> str:

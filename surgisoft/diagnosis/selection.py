@@ -499,13 +499,14 @@ def propose(selection: ModelSelection, first: list[Score]) -> tuple[Proposal, ..
     """The best single effect and the best two; whether any is missing is left open.
 
     The two are sought among all pairs, since the best single effect need not be one of them: where
-    two act, a third may explain most of both. None where even the best is within chance.
+    two act, a third may explain most of both, and neither of the two need be plausible alone. None
+    where all effects alone are within chance.
     """
     some = [score for score in first if not selection.in_fit(score.effect)]
-    if not some or not _worth_a_look(some[0]):
+    if not any(_worth_a_look(score) for score in some):
         return ()
     answer = [Proposal(selection, (some[0],))]
-    pair = best_pair(selection, some)
+    pair = best_pair(selection, [name for name in selection.options if not selection.in_fit(name)])
     if pair:
         answer.append(Proposal(selection, pair))
     return tuple(answer)
@@ -526,7 +527,7 @@ def _instead(selection: ModelSelection, named: Sequence[Score]) -> tuple[Score |
     return tuple(answer)
 
 
-def best_pair(selection: ModelSelection, first: Sequence[Score]) -> tuple[Score, ...]:
+def best_pair(selection: ModelSelection, effects: Sequence[str]) -> tuple[Score, ...]:
     """The best two of some effects, the one that would be missed most first; empty without any two.
 
     Pairs of forms are ranked by `_together`. Every form of one effect is tried beside the best form
@@ -550,10 +551,10 @@ def best_pair(selection: ModelSelection, first: Sequence[Score]) -> tuple[Score,
 
     best = [
         max(
-            selection.options[score.effect],
+            selection.options[effect],
             key=lambda form: _together(selection, null, form.chosen),
         )
-        for score in first
+        for effect in effects
     ]
     found = [improved(a, b) for a, b in combinations(best, 2)]
     for pair in sorted(found, key=lambda pair: -worth(*pair))[: SEARCH.pairs]:
@@ -694,9 +695,9 @@ def rmse_interval(problem: Problem, losses: np.ndarray, counts: np.ndarray) -> t
 def close_to_best(first: list[Score], share: float) -> list[Score]:
     """The best effect and those that explain at least a share of what it explains.
 
-    Empty where even the best is within chance.
+    Empty where all are within chance.
     """
-    if not first or not _worth_a_look(first[0]):
+    if not any(_worth_a_look(score) for score in first):
         return []
     best = first[0]
     others = [s for s in first[1:] if s.gain >= share * best.gain]

@@ -107,6 +107,23 @@ def test_two_that_are_not_plausible_beside_each_other_are_not_proposed(table, mo
     assert [p.effects for p in selection.propose(table, table.scores())] == [("blend",)]
 
 
+def test_one_of_two_need_not_be_plausible_alone(table):
+    """Beside a drift a weight alone would be negative: it is no candidate alone, but one of two."""
+    alone = [score for score in table.scores() if score.effect != "right"]
+    assert selection.propose(table, alone)[1].effects == ("right", "left")
+
+
+def test_nothing_is_proposed_only_where_every_effect_alone_is_within_chance(table):
+    """The effect that explains most may be within chance where a smaller one is not."""
+    first = [replace(score, p_value=0.5, gain=0.4) for score in table.scores()]
+    assert selection.propose(table, first) == ()
+    first[-1] = replace(first[-1], p_value=0.1)
+    one, two = selection.propose(table, first)
+    assert one.scores == (first[0],)
+    assert two.effects == ("right", "left")
+    assert selection.close_to_best(first, 0.9)[0] is first[0]
+
+
 def test_the_best_two_of_all_pairs_are_proposed_in_their_best_forms(table, monkeypatch):
     """Random losses of three effects with three forms each that two divide as products: the
     proposal leaves the least of all 27 pairs of forms, and the effect missed most comes first."""
@@ -119,8 +136,7 @@ def test_the_best_two_of_all_pairs_are_proposed_in_their_best_forms(table, monke
         monkeypatch.setattr(Table, "loss", loss)
         apart = [(i, j) for i, j in pairs if i // 3 != j // 3]
         least = min(apart, key=lambda pair: loss[f"{pair[0]}{pair[1]}"])
-        first = {score.effect: score for score in reversed(table.scores())}
-        found = selection.best_pair(table, list(first.values()))
+        found = selection.best_pair(table, NAMES)
         assert {score.option.candidate for score in found} == set(least)
         assert alone[found[0].option.alone] <= alone[found[1].option.alone]
 
@@ -132,8 +148,7 @@ def test_forms_are_exchanged_until_no_other_form_is_better(table, monkeypatch):
     loss |= {f"{i}{j}": 70 for i in range(3) for j in range(3, 6)}
     loss |= {"03": 60, "04": 50, "14": 40, "15": 30, "25": 10}
     monkeypatch.setattr(Table, "loss", loss)
-    first = {score.effect: score for score in reversed(table.scores())}
-    found = selection.best_pair(table, list(first.values()))
+    found = selection.best_pair(table, NAMES[:2])
     assert {score.option.candidate for score in found} == {2, 5}
 
 

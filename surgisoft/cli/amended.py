@@ -43,5 +43,5 @@ def show_parameters(parameters) -> None:
             unit = f" {each.unit}" if each.unit else ""
             print(
                 f"implausible: {each.effect} {each.name} = {values_text(each.value)}, expected "
-                f"{low:.3g} to {high:.3g}{unit} ({each.source})"
+                f"{values_text(low)} to {values_text(high)}{unit} ({each.source})"
             )

@@ -320,7 +320,8 @@ def _doubt(name: str, fall: Fall, parameters: tuple[Parameter, ...]) -> str:
     low, high = wrong[0].plausible_range
     return (
         f"{name} would lower the error to {fall.after:.3f} mm only with an implausible "
-        f"{wrong[0].name} = {values_text(wrong[0].value)}, expected {low:.3g} to {high:.3g}"
+        f"{wrong[0].name} = {values_text(wrong[0].value)}, expected {values_text(low)} to "
+        f"{values_text(high)}"
     )
 
 

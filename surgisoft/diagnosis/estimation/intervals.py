@@ -101,7 +101,7 @@ class Parameter:
         least, most = self.plausible_range
         return (
             "not identifiable from these recordings: the 95 % interval covers all plausible "
-            f"values, {least:.3g} to {most:.3g}"
+            f"values, {values_text(least)} to {values_text(most)}"
         )
 
     def to_json(self) -> dict:

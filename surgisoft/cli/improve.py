@@ -12,15 +12,17 @@ from surgisoft.cli.amended import (
     write_before_and_after,
 )
 from surgisoft.cli.files import check_folder, check_free, check_replay, show_written
-from surgisoft.cli.inputs import check_model, read_recordings, warn_all
+from surgisoft.cli.inputs import check_model, read_before, read_recordings, warn_all
 from surgisoft.cli.options import (
     REFIT_PROCESSES,
+    Before,
     EffectFiles,
     Force,
     JsonFile,
     Model,
     ModelError,
     NewModel,
+    Paired,
     Recordings,
     Refit,
     Replay,
@@ -39,6 +41,8 @@ def improve(
     most: Annotated[
         int, typer.Option("--max-effects", min=1, help="Largest number of effects to add.")
     ] = 6,
+    before: Before = None,
+    paired: Paired = "auto",
     json_file: JsonFile = None,
     report: Report = None,
     replay: Replay = None,
@@ -50,13 +54,15 @@ def improve(
     """Improve a model: repeat diagnosis and amendment until no further effect is significant.
 
     The result is validated on the last quarter of each recording. Where no effect was added, or
-    the error did not fall significantly, nothing is written (exit code 1).
+    the error did not fall significantly, nothing is written (exit code 1). With --before, what
+    has changed since is named and added, and the network stays as it is.
     """
     check_free(json_file, "rounds")
     check_folder(report)
     check_replay(replay)
     check_model(model)
     measured = read_recordings(recordings)
+    earlier = read_before(before, paired)
     claim_other_folder(output, model, force)
 
     from surgisoft.diagnosis.improve import improve as improve_model
@@ -78,6 +84,8 @@ def improve(
             refit_progress=tell,
             processes=REFIT_PROCESSES,
             error_mm=model_error,
+            before=earlier,
+            paired=paired,
         )
     warn_all(result.notes)
     written = []
@@ -124,6 +132,8 @@ def _show(result) -> None:
         fall = result.held_out
         width = max(len(name) for name, _ in result.steps) + 2
         part = "the held-out part"
+        if result.model_error is not None:
+            part = "the held-out part, of the change that is not explained"
         if fall.in_fit:
             part = f"the last part, of which the model had been fitted to {fall.in_fit:.0%}"
         print(f"{'before':{width}s} {fall.before:8.4f} mm on {part}")

@@ -10,7 +10,7 @@ been fitted by so much of the effects.
 
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from surgisoft.diagnosis.estimation.intervals import Parameter
 from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
 from surgisoft.diagnosis.other_models import name_of, open_model, refuse_predictions
-from surgisoft.diagnosis.pairs import LEAST_SHARE, Change, Paired, before_and_after
+from surgisoft.diagnosis.pairs import Change, Paired, before_and_after
 from surgisoft.diagnosis.refit import Refit, apart_mm, can_hide, fit_together, refit_reason
 from surgisoft.diagnosis.refit import refit as refit_effects
 from surgisoft.diagnosis.residuals import Problem, Sealed, residual_table
@@ -214,11 +214,7 @@ class Amendment:
             return f"{' + '.join(self.effects)}: {self._together}"
         text = f"{' + '.join(self.effects)}: {self.alone.sentence}"
         if self.model_error is not None:
-            whole = self.model_error
-            assert self.change is not None
-            change = f"unexplained change since {' + '.join(self.change.before)} "
-            text = text.replace("error ", change, 1)
-            text += f"; error of the model itself {whole.before:.3f} to {whole.after:.3f} mm"
+            text = of_change(text, self.change, self.model_error)
             return f"{text}, its network's last layer re-tuned" if self.retuned else text
         if not self.retuned:
             return text
@@ -326,10 +322,7 @@ def amend(
     both, earlier = None, []
     if before is not None:
         earlier = load_recordings(before)
-        both = before_and_after(plain, earlier, paired)
-        if both.used and both.pairs.paired[plain.held_out].mean() < LEAST_SHARE:
-            # Too few held-out rows have a partner for a final check of the paired difference.
-            both = replace(both, table=plain, used=False)
+        both = before_and_after(plain, earlier, paired).with_final_check()
         notes, table = (*notes, *both.notes), both.table
     problem = table.training()
     names = list(dict.fromkeys(names))
@@ -448,6 +441,13 @@ def _fall(before: np.ndarray, after: np.ndarray, count: np.ndarray) -> np.ndarra
     """(...) fall of the RMS error from sums of squares and counts (...)."""
     count = np.maximum(count, 1)
     return np.sqrt(before / count) - np.sqrt(after / count)
+
+
+def of_change(sentence: str, change: Change | None, whole: Fall) -> str:
+    """The sentence of a fall of the paired difference, with the model's own error beside it."""
+    since = f" since {' + '.join(change.before)}" if change is not None else ""
+    text = sentence.replace("error ", f"unexplained change{since} ", 1)
+    return f"{text}; error of the model itself {whole.before:.3f} to {whole.after:.3f} mm"
 
 
 def track_of(before: Problem, after: Problem) -> Track:

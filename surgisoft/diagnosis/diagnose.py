@@ -309,22 +309,37 @@ def diagnose(
             "--before only the change since then is explained, which the network never saw; "
             "leave out one of the two"
         )
-    found, not_testable = findings_of(problem, report, without)
-    result = replace(result_of(found), not_testable=not_testable)
     if both is not None:
-        result = with_less(since(result, both, found), found)
-    elif reason:
-        cannot = [*without, *(each.effect for each in not_testable)]
-        joint = fit_candidates_together(
-            problem, reason, cannot, progress=refit_progress, processes=processes
-        )
-        result = with_refit(result, joint, problem)
-    if result.verdict.kind == "unknown_effect":
-        result = with_axis(result, problem)
+        result = diagnose_change(problem, both, report, without)
+    else:
+        found, not_testable = findings_of(problem, report, without)
+        result = replace(result_of(found), not_testable=not_testable)
+        if reason:
+            cannot = [*without, *(each.effect for each in not_testable)]
+            joint = fit_candidates_together(
+                problem, reason, cannot, progress=refit_progress, processes=processes
+            )
+            result = with_refit(result, joint, problem)
+        if result.verdict.kind == "unknown_effect":
+            result = with_axis(result, problem)
     if result.next_command.startswith("surgisoft amend"):
         unknown = not held_out_in_fit(model, whole, table.held_out)
         result = replace(result, next_command=amend_command(result, unknown))
     return replace(result, notes=notes, seconds=time.perf_counter() - begin)
+
+
+def diagnose_change(
+    problem: Problem, both: BeforeAfter, report: Progress, without: Collection[str] = ()
+) -> Diagnosis:
+    """Name the effects that explain what has changed between two sets of recordings.
+
+    problem: training rows of the recordings after the change, as `BeforeAfter.training` poses them,
+    of the given model or of one that was amended since.
+    """
+    found, not_testable = findings_of(problem, report, without)
+    result = replace(result_of(found), not_testable=not_testable)
+    result = with_less(since(result, both, found), found)
+    return with_axis(result, problem) if result.verdict.kind == "unknown_effect" else result
 
 
 def amend_command(result: Diagnosis, unknown: bool) -> str:

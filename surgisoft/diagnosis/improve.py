@@ -4,24 +4,30 @@ Every round adds an effect that a diagnosis names and fits it together with thos
 before. The network's last layer is re-tuned at the end, where held-out motion rewards it. All of
 this sees the training rows of the recordings only; the held-out rows are evaluated once, at the
 end, for the errors of all rounds, and decide nothing but whether the whole fall is claimed.
+
+With recordings from before a change, every round diagnoses and amends that change: the paired
+difference, of which the given model predicts BEFORE in all rounds, or the model's residuals less
+what of those on BEFORE can be learned. The network, which was fitted to neither, stays as it is.
 """
 
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 
-from surgisoft.diagnosis.amend import Fall, Track, fall_of, track_of
-from surgisoft.diagnosis.diagnose import Diagnosis, diagnose
+from surgisoft.diagnosis.amend import Fall, Track, fall_of, of_change, track_of
+from surgisoft.diagnosis.diagnose import Diagnosis, diagnose, diagnose_change, with_setup
 from surgisoft.diagnosis.estimation.effects import Fitted, fit_effects, fit_plausible
 from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
 from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
 from surgisoft.diagnosis.other_models import name_of, open_model, refuse_predictions
+from surgisoft.diagnosis.pairs import Change, Paired, before_and_after
 from surgisoft.diagnosis.refit import JointFit, apart_mm, fit_together
 from surgisoft.diagnosis.residuals import Sealed, model_discrepancy, residual_table
+from surgisoft.diagnosis.setup import find_setup_faults
 from surgisoft.errors import InputError
 from surgisoft.files import with_former_keys
-from surgisoft.measurement.recordings import Recording
+from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
 from surgisoft.surrogate.fitted_rows import FittedRows
@@ -85,7 +91,8 @@ class Improvement:
     parameters: tuple[Parameter, ...]
     """The fitted parameters of all added effects."""
     held_out: Fall
-    """The error on the held-out rows, before the first and after the last round."""
+    """The error on the held-out rows, before the first and after the last round; of the paired
+    difference where there is one."""
     tracks: tuple[Track, Track]
     """The error along the training and along the held-out rows."""
     seconds: float
@@ -98,6 +105,12 @@ class Improvement:
     """Name of the given model; empty for one that was given as an object."""
     recordings: tuple[str, ...] = ()
     """Names of the recordings."""
+    change: Change | None = None
+    """How far the recordings differ from those before the change; where rows are paired, errors are
+    those of the paired difference, and None where no recordings from before were given."""
+    model_error: Fall | None = None
+    """The error of the model itself on the held-out rows, where the others are paired
+    differences."""
 
     @property
     def steps(self) -> list[tuple[str, float]]:
@@ -132,7 +145,10 @@ class Improvement:
                 f"{names}: error reduced from {fall.numbers(where)}, fitted together with the "
                 "network; none of these errors is on unseen data"
             )
-        return f"{names}: {fall.sentence}"
+        text = fall.sentence
+        if self.model_error is not None:
+            text = of_change(text, self.change, self.model_error)
+        return f"{names}: {text}"
 
     def to_json(self) -> dict:
         """Plain values, as `improve --json` writes them.
@@ -151,6 +167,8 @@ class Improvement:
             "seconds": self.seconds,
             "amended_from": self.amended_from,
             "recordings": list(self.recordings),
+            "change": self.change and self.change.to_json(),
+            "error_model_mm": self.model_error and self.model_error.to_json(),
         }
 
 
@@ -165,6 +183,8 @@ def improve(
     refit_progress: RefitProgress = silent,
     processes: int = 1,
     error_mm: float | None = None,
+    before: Recordings | None = None,
+    paired: Paired = "auto",
 ) -> Improvement:
     """Add effects to a model one by one, until no further one is significant.
 
@@ -175,8 +195,11 @@ def improve(
     Model and recordings may be given by their paths; a callable, or its name, is a model too, with
     error_mm as its validated error, mm (docs/your_model.md).
 
-    reference, refit, refit_progress, processes: as for `diagnose`. An effect that a refit names is
-    fitted together with the whole network.
+    before, paired, reference, refit, refit_progress, processes: as for `diagnose`. An effect that a
+    refit names is fitted together with the whole network. With recordings from before a change,
+    every round names and adds what has changed since, and the network stays as it is; where rows
+    are paired, errors are those of the paired difference, and `Improvement.model_error` is that of
+    the model itself.
     """
     if most_effects < 1:
         raise InputError(f"largest number of effects is {most_effects}, expected 1 or more")
@@ -184,12 +207,26 @@ def improve(
     tell = progress or (lambda done: None)
     refuse_predictions(model)
     given = name_of(model)
-    model, recordings, _ = open_model(model, recordings, None, None, error_mm)
+    if before is None and not isinstance(reference, TrainingResiduals | None):
+        before, reference = reference, None
+    model, recordings, before = open_model(model, recordings, before, None, error_mm)
     model, recordings, notes = open_inputs(model, recordings)
     known, sealed = model.training_residuals, Sealed(recordings)
     recordings = sealed.training
     table = residual_table(model, recordings)
     problem = table.training()
+    both, earlier = None, []
+    if before is not None:
+        if refit == "always":
+            raise InputError(
+                "--refit always trains the network too, but with --before only the change since "
+                "then is explained, which the network never saw; leave out one of the two"
+            )
+        earlier = load_recordings(before)
+        both = before_and_after(table, earlier, paired).with_final_check()
+        notes, problem = (*notes, *both.notes), both.table.training()
+        asked = both.training()
+    is_paired = both is not None and both.used
     models, rounds = [model], []
     parameters: tuple[Parameter, ...] = ()
     diagnoses: list[Diagnosis] = []
@@ -199,10 +236,14 @@ def improve(
         rounds.append(done)
         tell(done)
 
-    going, trained = True, False  # whether the network was trained on these rows
-    while going and len(added) < most_effects:
-        found = diagnose(
-            models[-1],
+    def diagnosis_of(current: ArmModel) -> Diagnosis:
+        if both is not None:
+            wrong = None if added else find_setup_faults(current, recordings)
+            if wrong is not None:
+                return with_setup(wrong)
+            return diagnose_change(asked.with_model(current), both, lambda text: None)
+        return diagnose(
+            current,
             recordings,
             reference=known if reference is None else reference,
             refit=refit,
@@ -210,24 +251,28 @@ def improve(
             processes=processes,
             setup_tests=not added,
         )
+
+    going, trained = True, False  # whether the network was trained on these rows
+    while going and len(added) < most_effects:
+        found = diagnosis_of(models[-1])
         diagnoses.append(found)
         error = fall_of(problem, problem.with_model(models[-1])).after
         current = Round(found.verdict.kind, found.verdict.sentence, None, (), None, error)
         names = [name for name in next_effects(found) if name not in added]
         going = False
         for name in names[: most_effects - len(added)]:
-            before = problem.with_model(models[-1])
+            posed = problem.with_model(models[-1])
             fitted: Fitted | JointFit
             together = found.refit is not None and found.refit.winner == name
             if found.refit is not None and together and refit == "auto" and not trained:
-                plain_mm = apart_mm(before, [*added, name])
+                plain_mm = apart_mm(posed, [*added, name])
                 together = plain_mm is None or plain_mm > found.refit.of(name).heldout_rmse_mm
             if found.refit is not None and together:
                 validated = found.refit.of(name)
-                fitted = fit_together(before, [*added, name], validated, progress=refit_progress)
+                fitted = fit_together(posed, [*added, name], validated, progress=refit_progress)
             else:
-                fitted = fit_effects(before, [*added, name])
-            fall = fall_of(before, problem.with_model(fitted.model))
+                fitted = fit_effects(posed, [*added, name])
+            fall = fall_of(posed, problem.with_model(fitted.model))
             doubt = _doubt(name, fall, fitted.parameters)
             if not doubt and isinstance(fitted, JointFit):
                 alone, together_ = (
@@ -235,9 +280,9 @@ def improve(
                 )
                 doubt = _idle(name, fall_of(alone, together_))
             if doubt and fall.significant and isinstance(fitted, Fitted):
-                tried = fit_plausible(before, fitted, [*added, name], name)
+                tried = fit_plausible(posed, fitted, [*added, name], name)
                 if tried is not None:
-                    less = fall_of(before, problem.with_model(tried.model))
+                    less = fall_of(posed, problem.with_model(tried.model))
                     if _as_good(less, fall) and not _doubt(name, less, tried.parameters):
                         fitted, fall, doubt = tried, less, ""
             if doubt:
@@ -256,8 +301,8 @@ def improve(
             current = replace(current, sentence=f"named beside {name} by the same diagnosis")
         if not going:
             note(current)
-    tuned = retune(models[-1], problem)
-    if added and tuned.kept:
+    tuned = retune(models[-1], problem) if added and both is None else None
+    if tuned is not None and tuned.kept:
         after = fall_of(problem, problem.with_model(tuned.model)).after
         why = (
             "a re-tuned network lowers the squared error on held-out motion by "
@@ -266,11 +311,14 @@ def improve(
         models.append(tuned.model)
         note(Round("surrogate_undertrained", why, NETWORK, (), None, after))
     if models[-1] is not model:
-        kept = not (added and tuned.kept)
         # The residuals of the fit say nothing of a network that was re-tuned since.
-        models[-1].training_residuals = known if kept else None
+        retuned = tuned is not None and tuned.kept
+        models[-1].training_residuals = None if retuned else known
         models[-1].fitted_rows = FittedRows.of([table.history]).joined(model.fitted_rows)
-    held_out = sealed.opened(table).final_check()
+    opened = sealed.opened(table)
+    held_out = whole = opened.final_check()
+    if is_paired:
+        held_out = before_and_after(opened, earlier, "always").table.final_check()
     after_round = iter([held_out.with_model(one) for one in models[1:]])
     final, shown = held_out, []
     for done in rounds:
@@ -287,6 +335,8 @@ def improve(
         diagnoses=tuple(diagnoses),
         amended_from=given,
         recordings=tuple(each.name for each in recordings),
+        change=None if both is None else both.change,
+        model_error=fall_of(whole, whole.with_model(models[-1])) if is_paired else None,
     )
 
 

@@ -980,6 +980,12 @@ class BeforeAfter:
             stretches=pairs.stretches,
         )
 
+    def with_final_check(self) -> "BeforeAfter":
+        """The same, unpaired where too few held-out rows have a partner for a final check."""
+        if self.used and self.pairs.paired[self.plain.held_out].mean() < LEAST_SHARE:
+            return replace(self, table=self.plain, used=False)
+        return self
+
     @property
     def notes(self) -> tuple[str, ...]:
         """Limits of the result, in words."""

@@ -231,7 +231,8 @@ def test_amend_and_improve_write_nothing_where_nothing_is_claimed(
     ]  # fmt: skip
     found = result(
         claimed=False, rounds=rounds, steps=[("creep", 0.3)], parameters=[PARAMETER, UNITLESS],
-        held_out=SimpleNamespace(before=0.5, floor=0.1, in_fit=0.0), sentence="no significant fall",
+        held_out=SimpleNamespace(before=0.5, floor=0.1, in_fit=0.0), model_error=None,
+        sentence="no significant fall",
     )  # fmt: skip
     command = ["improve", "default", rec, "-o", new, "--json", numbers + ".json"]
     target = "surgisoft.diagnosis.improve.improve"

@@ -42,9 +42,14 @@ def bare_arm() -> ArmModel:
     return arm.replace(effects={}).eval()
 
 
-def measured_on(truth: ArmModel, runs: int = 4, rows: int = 400, seed: int = 0) -> Recording:
-    """What cameras with white noise would record of a model that is the truth, at 10 Hz."""
-    rng = np.random.default_rng(seed)
+def measured_on(
+    truth: ArmModel, runs: int = 4, rows: int = 400, seed: int = 0, noise_seed: int | None = None
+) -> Recording:
+    """What cameras with white noise would record of a model that is the truth, at 10 Hz.
+
+    noise_seed: seed of the noise alone; default: the one of the schedule.
+    """
+    rng = np.random.default_rng(seed if noise_seed is None else noise_seed)
     low, high = np.array(truth.spec.low), np.array(truth.spec.high)
     pressure = np.concatenate([walk(rows, 3, seed * 100 + run) for run in range(runs)])
     pressure = low + (high - low) * pressure / 10

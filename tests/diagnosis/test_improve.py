@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from surgisoft.cli import run
@@ -15,7 +16,9 @@ from surgisoft.diagnosis.residuals import held_out_rows
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.surrogate.checkpoint import load_model, save_model
+from tests.diagnosis.synthetic import NOISE_MM
 from tests.diagnosis.test_estimation import TRUTHS, bare_arm, measured_on, with_truth
+from tests.diagnosis.test_estimation import rms as rms_distance
 
 
 def said(kind: str, *effects: str) -> Diagnosis:
@@ -67,6 +70,51 @@ def test_a_model_that_misses_nothing_is_left_alone(tmp_path, capsys):
     assert run([*command, "-o", str(tmp_path / "new")]) == 1
     assert "nothing was added" in capsys.readouterr().out
     assert not (tmp_path / "new").exists()
+
+
+def test_with_recordings_from_before_only_what_has_changed_is_added(tmp_path, capsys):
+    """The frame was turned all along; creep and gains are new. By the end, the change is explained
+    to the noise of a difference of two measurements, and the model's error is what it was."""
+    turned = TRUTHS["misalignment"]
+    now = with_truth("creep", {"amount": [0.15], "log_tau": [2.0], "log_width": [0.3]}, turned)
+    now = with_truth("gain_mismatch", {"gain": [0.06, -0.02, -0.05]}, now)
+    before, after = measured_on(turned, rows=250), measured_on(now, rows=250, noise_seed=5)
+    after = replace(after, name="after")
+    save_model(bare_arm(), tmp_path / "arm")
+    save_recording(before, tmp_path / "before.parquet")
+    save_recording(after, tmp_path / "after.parquet")
+    command = ["improve", str(tmp_path / "arm"), str(tmp_path / "after.parquet")]
+    command += ["--before", str(tmp_path / "before.parquet"), "-o", str(tmp_path / "new")]
+    assert run([*command, "--json", str(tmp_path / "a.json"), "--report", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert "unexplained change since before reduced from" in out
+    values = json.loads((tmp_path / "a.json").read_text())
+    assert set(values["effects"]) == {"creep", "gain_mismatch"}
+    assert not values["network_retuned"]
+    last = values["rounds"][-1]
+    assert (last["step"], last["verdict"]) == (None, "nothing_missing"), "asked of the new model"
+    rows = held_out_rows([after])
+    assert values["error_mm"]["rows"] == rows.sum()
+    changed = (after.key_points_mm - before.key_points_mm)[rows]
+    assert values["error_mm"]["before"] == pytest.approx(rms_distance(changed), rel=1e-4)
+    assert values["error_mm"]["after"] < 1.1 * np.sqrt(6) * NOISE_MM
+    assert set(load_model(tmp_path / "new").effects) == {"creep", "gain_mismatch"}
+    own = np.square(
+        (
+            measured_on(turned, rows=250, noise_seed=5).key_points_mm
+            - measured_on(bare_arm(), rows=250).key_points_mm
+        )[rows]
+    )
+    assert values["error_model_mm"]["after"] == pytest.approx(
+        np.sqrt(own.sum(2).mean() - 3 * NOISE_MM**2), rel=0.05
+    )
+    assert "Change that is not explained" in (tmp_path / "report.html").read_text()
+
+
+def test_recordings_from_before_and_a_refit_exclude_each_other():
+    recording = measured_on(bare_arm(), rows=200)
+    with pytest.raises(InputError, match="leave out one of the two"):
+        improve(bare_arm(), [recording], before=[recording], refit="always")
 
 
 def test_a_wrong_diagnosis_is_not_followed(recited):

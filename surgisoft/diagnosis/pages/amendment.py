@@ -63,6 +63,7 @@ def amend_page(result: Amendment, title: str, about: str) -> Page:
             ("noise floor", f"{fall.floor:.3f} mm"),
             ("fall, 95 %", f"{fall.ci95[0]:.3f} .. {fall.ci95[1]:.3f} mm"),
             ("held-out rows", f"{fall.rows}"),
+            *_of_model(result.model_error),
             *_in_fit(fall),
         ]
     )
@@ -101,6 +102,13 @@ def how_to_read(fall: Fall) -> list[Part]:
 def _in_fit(fall: Fall) -> list[tuple[str, str]]:
     """The share of the held-out rows in the given model's fit, where there is one."""
     return [("of them in the model's fit", f"{fall.in_fit:.0%}")] if fall.in_fit else []
+
+
+def _of_model(whole: Fall | None) -> list[tuple[str, str]]:
+    """The model's own error, where the others are paired differences."""
+    if whole is None:
+        return []
+    return [("error of the model itself", f"{whole.before:.3f} to {whole.after:.3f} mm")]
 
 
 def _use(fall: Fall) -> str:
@@ -190,6 +198,7 @@ def improve_page(
             ("noise floor", f"{fall.floor:.3f} mm"),
             ("fall, 95 %", f"{fall.ci95[0]:.3f} .. {fall.ci95[1]:.3f} mm"),
             ("steps", f"{len(result.steps)}"),
+            *_of_model(result.model_error),
             *_in_fit(fall),
         ]
     )
@@ -201,11 +210,11 @@ def improve_page(
     if drawn is not None:
         alt = "The body before and after, measured and predicted, with one scale of the errors"
         failed.append(Picture.from_file(drawn, alt, f"{alt}; held-out part", 620))
+    what = "Error" if result.model_error is None else "Change that is not explained"
+    use = _use(fall) if fall.in_fit else "not used in any round"
     captions = {
-        f"Error on the held-out part: {_use(fall) if fall.in_fit else 'not used in any round'}": (
-            held_out
-        ),
-        "Error on the training part: diagnosed and fitted on it": training,
+        f"{what}, held-out part: {use}": held_out,
+        f"{what}, training part: diagnosed and fitted on it": training,
     }
     failed += track_charts(captions, fall.floor)
     parts.append(Section("Where the model failed", failed))

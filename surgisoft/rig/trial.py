@@ -5,8 +5,10 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from surgisoft.errors import InputError
-from surgisoft.measurement.protocols import Protocol, make_protocol
+from surgisoft.measurement.protocols import Protocol, load_schedule, make_protocol
 from surgisoft.measurement.recordings import Recording
 from surgisoft.progress import Progress, silent
 from surgisoft.rig.collect import collect as collect_samples
@@ -28,7 +30,7 @@ def rig_of_trial(
     **mount: Any,
 ) -> Rig:
     """Open the rig of a name with the robot and the noise of one trial; see `collect`."""
-    number = zlib.crc32(f"{protocol} {trial}".encode())
+    number = noise_number(protocol, trial)
     given: dict[str, Any] = dict(mount)
     if tuple(hidden):
         given["hidden"] = tuple(hidden)
@@ -39,6 +41,23 @@ def rig_of_trial(
         if "seed" in known:
             given["seed"] = seed
     return open_rig(rig, defaults, **given)
+
+
+def noise_number(protocol: str | Path | Protocol, trial: int) -> int:
+    """Seed of the noise of a trial.
+
+    It follows from the name of a protocol of the catalogue, and from the commands of any other:
+    a schedule gives the same recording whatever its file is called and wherever it lies.
+    """
+    if not isinstance(protocol, Protocol):
+        if not str(protocol).endswith(".csv"):
+            return zlib.crc32(f"{protocol} {trial}".encode())
+        protocol = load_schedule(protocol)
+    times = np.zeros(0) if protocol.t_s is None else protocol.t_s
+    number = zlib.crc32(str(trial).encode())
+    for values in (protocol.commands, protocol.run, times):
+        number = zlib.crc32(np.ascontiguousarray(values).tobytes(), number)
+    return number
 
 
 def collect(

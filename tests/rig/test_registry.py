@@ -9,6 +9,7 @@ import pytest
 import surgisoft
 from surgisoft.cli import run
 from surgisoft.errors import InputError
+from surgisoft.measurement.protocols import load_schedule
 from surgisoft.measurement.recordings import load_recording
 from surgisoft.rig import SafeRig, VirtualRig, open_rig
 from surgisoft.rig.interface import close, is_simulated, vent
@@ -123,6 +124,22 @@ def test_the_seed_in_the_text_is_the_seed_of_collect(tmp_path):
     one, other = load_recording(a), load_recording(b)
     np.testing.assert_array_equal(one.key_points_mm, other.key_points_mm)
     np.testing.assert_array_equal(one.commanded, other.commanded)
+
+
+def test_a_schedule_gives_the_same_recording_wherever_it_lies(tmp_path, monkeypatch):
+    rows = "t_s,c1_kPa,c2_kPa,c3_kPa\n0,0,0,0\n1,20,5,0\n2,5,30,10\n"
+    (tmp_path / "there").mkdir()
+    (tmp_path / "a.csv").write_text(rows)
+    (tmp_path / "there" / "b.csv").write_text(rows)
+    first = surgisoft.collect(tmp_path / "a.csv")
+    monkeypatch.chdir(tmp_path / "there")
+    for given in ("b.csv", Path("../a.csv"), load_schedule("b.csv")):
+        again = surgisoft.collect(given)
+        np.testing.assert_array_equal(again.key_points_mm, first.key_points_mm)
+    noise = [surgisoft.collect("b.csv", trial=1).measured - first.measured]
+    Path("c.csv").write_text(rows.replace("5,30,10", "5,30,10.5"))
+    noise.append((surgisoft.collect("c.csv").measured - first.measured)[:10])
+    assert all(np.abs(each).max() > 0 for each in noise), "other trials and schedules, other noise"
 
 
 def test_collect_drives_a_users_rig_and_refuses_what_it_has_no_option_for(tmp_path, capsys):

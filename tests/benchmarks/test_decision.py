@@ -402,7 +402,7 @@ def test_robots_that_judge_took_no_part_in_the_fit():
     fitted = {(one.source, one.robot) for some in stored().values() for one in some}
     assert fitted
     judges = stored(EVIDENCE / JUDGED)
-    assert set(judges) == {"elastica_b", "lattice"}
+    assert "elastica_b" in judges
     for name, some in judges.items():
         kin = next((source for source in stored() if name.startswith(source)), name)
         assert not fitted & {(kin, one.robot) for one in some}

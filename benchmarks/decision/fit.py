@@ -5,8 +5,9 @@ sign constraints by bounded L-BFGS: Byrd et al. 1995). Every source counts alike
 cases; pairs have a stated share of every source (PRIORS). The penalty of each model is chosen by
 leaving out one source after another, and one group of robots after another, within the cases that
 it is fitted to. Robots left out inside the same cases also give the curves that calibrate the first
-effect and the set of two (Platt 1999), and the cost of a wrong "unknown". So nothing of a source
-that is judged enters any choice.
+effect and the set of two (Platt 1999), and the costs of names; sources left out give the cost of a
+wrong "unknown", since an arm that is like none of the cases is what looks like an unknown effect.
+So nothing of a source that is judged enters any choice.
 """
 
 import datetime
@@ -289,10 +290,15 @@ def _models(cases: Sequence[Labelled], settings: Settings) -> dict[str, Logistic
 Predicted = list[tuple[Labelled, Probabilities]]
 
 
-def held_out(cases: Sequence[Labelled], settings: Settings) -> Predicted:
-    """What models that were fitted without a robot say of its real cases, before calibration."""
+def held_out(
+    cases: Sequence[Labelled], settings: Settings, folds: Sequence[np.ndarray]
+) -> Predicted:
+    """What models that were fitted without the cases of a fold say of them, before calibration.
+
+    folds: (N,) masks of the cases that are left out together. Only real cases are asked.
+    """
     answer = []
-    for fold in _robot_folds(cases):
+    for fold in folds:
         train, left = _split(cases, fold)
         model = DecisionModel(_models(train, settings), {})
         real = [case for case in left if not case.left_out]
@@ -324,17 +330,19 @@ def curve_of(count: int, predicted: Predicted) -> Curve:
     return Curve(float(found.x[0]), float(np.exp(found.x[1])))
 
 
-def costs_of(predicted: Predicted, curves: dict[str, Curve]) -> Worth:
-    """The costs of wrong results, from cases of robots that were left out.
+def costs_of(predicted: Predicted, foreign: Predicted, curves: dict[str, Curve]) -> Worth:
+    """The costs of wrong results, from cases of robots (predicted) and sources (foreign) left out.
 
     First those of a wrong name and of a needless one: with which the fewest names are wrong, and at
     most `NAMED_LOST` fewer known effects are named than with the costs of `Worth`. Of equal ones
-    the least. Then the least cost of a wrong "unknown" with which at most `MOST_CALLED_UNKNOWN` of
-    known effects and unchanged arms are called unknown. Shares are means over the sources.
+    the least. Then the least cost of a wrong "unknown" with which, in sources left out, at most
+    `MOST_CALLED_UNKNOWN` of known effects and unchanged arms are called unknown. Shares are means
+    over the sources.
     """
     some = [(case, calibrated(chances, curves)) for case, chances in predicted]
     known = [one for one in some if one[0].label == "known" and one[0].size >= WEAK]
-    kept = [one for one in some if one[0].label in ("known", "clean")]
+    abroad = [(case, calibrated(chances, curves)) for case, chances in foreign]
+    kept = [one for one in abroad if one[0].label in ("known", "clean")]
 
     def share(of: Predicted, worth: Worth, hit: Callable[[Labelled, Decision], bool]) -> float:
         rates = []
@@ -388,7 +396,8 @@ def fit(cases: Sequence[Labelled], command: str = "") -> dict:
             "cases": sum(not case.left_out for _, _, case in samples[name]),
             "without_truth": sum(bool(case.left_out) for _, _, case in samples[name]),
         }
-    predicted = held_out(cases, settings)
+    predicted = held_out(cases, settings, _robot_folds(cases))
+    foreign = held_out(cases, settings, _source_folds(cases)) or predicted
     curves = {name: curve_of(count, predicted) for count, name in enumerate(CALIBRATED, 1)}
     values = {
         "schema": SCHEMA,
@@ -401,7 +410,7 @@ def fit(cases: Sequence[Labelled], command: str = "") -> dict:
             for name, one in curves.items()
         },
     }
-    worth = costs_of(predicted, curves)
+    worth = costs_of(predicted, foreign, curves)
     values |= {name: getattr(worth, name) for name in CHOSEN_COSTS}
     return values | {"sha256": content_hash(values)}
 

@@ -190,7 +190,7 @@ def test_a_calibration_gives_back_how_often_effects_are_missing():
 
 @pytest.mark.parametrize(("chance", "cost"), [(0.25, 0.25), (0.4, 0.7), (0.6, 2.0)])
 def test_the_cost_of_a_wrong_unknown_keeps_known_effects_known(chance, cost):
-    """One in ten known effects has this probability of being outside the list."""
+    """One in ten known effects, of sources left out, is outside the list with this probability."""
     predicted = []
     for number in range(20):
         odd = number < 2
@@ -200,8 +200,9 @@ def test_the_cost_of_a_wrong_unknown_keeps_known_effects_known(chance, cost):
             effects = {f"effect {place}": (1.0 - chance) / 5 for place in range(5)}
         rest = 1.0 - unknown - sum(effects.values())
         predicted.append((case(number), Probabilities(rest, 0.0, unknown, effects, 0.0, ())))
-    assert costs_of(predicted, {}).wrong_unknown == -cost
-    assert costs_of(predicted[2:], {}).wrong_unknown == -0.25
+    usual = predicted[2:]
+    assert costs_of(usual, predicted, {}).wrong_unknown == -cost, "of sources left out"
+    assert costs_of(predicted, usual, {}).wrong_unknown == -0.25
 
 
 @pytest.mark.parametrize(
@@ -230,7 +231,7 @@ def test_the_fewest_wrong_names_that_cost_few_right_ones(wrong, right, needless,
         clean = case(number, label="clean", truth=(), size=0.0)
         chances = Probabilities(1 - chance, 0.0, 0.0, {"creep": chance}, 0.0, ())
         predicted.append((clean, chances))
-    found = costs_of(predicted, {})
+    found = costs_of(predicted, predicted, {})
     assert (-found.wrong_name, -found.needless_name) == costs
 
 

@@ -10,7 +10,8 @@ has one field more, `fit`: the budget of the fit of the robot's model.
 
 from benchmarks.chain.rig import ChainRig
 from benchmarks.chain.robot import build_of, make_robot
-from benchmarks.rig_cases import Generator, main
+from benchmarks.generators import generator
+from benchmarks.rig_cases import main
 
 ROBOTS = "600,601,602,603,604,605"
 """Seeds of the default robots: one of each build."""
@@ -26,31 +27,7 @@ UNKNOWN = (
 )
 """Hidden effects for which a diagnosis has no name."""
 
-
-def before_s(robot: int) -> dict[str, float]:
-    """Durations of the recordings before a change [s]: those of the robot's build."""
-    return dict(zip(("mixed", "other"), build_of(robot).before_s, strict=True))
-
-
-def hundreds_of_mm(robot: int) -> float:
-    """Length of the arm in units of 100 mm."""
-    return make_robot(robot).length_mm / 100.0
-
-
-def about(robot: int) -> dict:
-    """Budget of the fit of the robot's model."""
-    return {"fit": {"epochs": build_of(robot).epochs}}
-
-
-GENERATOR = Generator(
-    ChainRig,
-    UNKNOWN,
-    UNKNOWN,
-    before_s,
-    hundreds_of_mm,
-    about,
-    tries=4,
-)
+GENERATOR = generator(ChainRig, UNKNOWN, build_of, make_robot, tries=4)
 """Chains of rigid links."""
 
 if __name__ == "__main__":

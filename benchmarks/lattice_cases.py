@@ -8,9 +8,10 @@
 has one field more, `fit`: the budget of the fit of the robot's model.
 """
 
+from benchmarks.generators import generator
 from benchmarks.lattice.rig import LatticeRig
 from benchmarks.lattice.robot import build_of, make_robot
-from benchmarks.rig_cases import Generator, main
+from benchmarks.rig_cases import main
 
 ROBOTS = "700,701,702,703,704"
 """Seeds of the default robots: one of each build."""
@@ -26,31 +27,7 @@ UNKNOWN = (
 )
 """Hidden effects for which a diagnosis has no name."""
 
-
-def before_s(robot: int) -> dict[str, float]:
-    """Durations of the recordings before a change [s]: those of the robot's build."""
-    return dict(zip(("mixed", "other"), build_of(robot).before_s, strict=True))
-
-
-def hundreds_of_mm(robot: int) -> float:
-    """Length of the arm in units of 100 mm."""
-    return make_robot(robot).length_mm / 100.0
-
-
-def about(robot: int) -> dict:
-    """Budget of the fit of the robot's model."""
-    return {"fit": {"epochs": build_of(robot).epochs}}
-
-
-GENERATOR = Generator(
-    LatticeRig,
-    UNKNOWN,
-    UNKNOWN,
-    before_s,
-    hundreds_of_mm,
-    about,
-    tries=1,
-)
+GENERATOR = generator(LatticeRig, UNKNOWN, build_of, make_robot, tries=1)
 """Lattices of springs."""
 
 if __name__ == "__main__":

@@ -29,33 +29,13 @@ that loses its current now and then).
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 
 from benchmarks.chain.plant import Plant, move, new_state, place_links
 from benchmarks.chain.robot import STREAM
-from surgisoft.rig.hidden import Hidden, random_direction, switch_on_from
-
-EVENT_WINDOW_S = (20.0, 130.0)
-"""Window of time since switching on in which an event that occurs once falls [s]: in one of the
-first runs of a recording, or between them."""
-
-
-@dataclass
-class Setup:
-    """What a hidden effect may change."""
-
-    plant: Plant
-    """Parameters of the robot."""
-
-
-def _set(setup: Setup, **values) -> None:
-    setup.plant = setup.plant._replace(**values)
-
-
-def _set_wall(setup: Setup, **values) -> None:
-    _set(setup, wall=setup.plant.wall._replace(**values))
+from benchmarks.generators import EVENT_WINDOW_S, Setup, breath, misalignment, sideways
+from surgisoft.rig.hidden import Hidden, switch_on_from
 
 
 def _length(setup: Setup) -> float:
@@ -63,19 +43,13 @@ def _length(setup: Setup) -> float:
     return setup.plant.link * len(setup.plant.mass)
 
 
-def _sideways(rng: np.random.Generator) -> np.ndarray:
-    """(3,) random unit vector across the arm."""
-    angle = rng.uniform(0, 2 * np.pi)
-    return np.array([math.cos(angle), math.sin(angle), 0.0])
-
-
 def _payload(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    _set(setup, tip=setup.plant.tip + 0.08 * strength * float(setup.plant.mass.sum()))
+    setup.change(tip=setup.plant.tip + 0.08 * strength * float(setup.plant.mass.sum()))
 
 
 def _hysteresis(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     limit, half = setup.plant.wall.friction
-    _set_wall(setup, friction=np.array([limit + 0.06 * strength, half * rng.uniform(0.8, 2.0)]))
+    setup.change_wall(friction=np.array([limit + 0.06 * strength, half * rng.uniform(0.8, 2.0)]))
 
 
 def _gain_mismatch(setup: Setup, strength: float, rng: np.random.Generator) -> None:
@@ -84,29 +58,26 @@ def _gain_mismatch(setup: Setup, strength: float, rng: np.random.Generator) -> N
     two = rng.permutation(len(areas))[:2]
     for chamber, share in zip(two, (0.07, -rng.uniform(0.0, 0.05)), strict=True):
         areas[chamber] *= math.exp(strength * share * rng.choice([-1.0, 1.0]))
-    _set(setup, areas=areas)
+    setup.change(areas=areas)
 
 
 def _line_lag(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     """Lines so narrow that a chamber follows within a good part of a second; unlike lengths."""
     m = len(setup.plant.areas)
-    _set(setup, gas=setup.plant.gas._replace(line=0.6 / strength * rng.uniform(0.7, 1.3, m)))
+    setup.change(gas=setup.plant.gas._replace(line=0.6 / strength * rng.uniform(0.7, 1.3, m)))
 
 
 def _creep(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     share = 1.0 - math.exp(-0.2 * strength)
-    _set_wall(setup, relaxing=np.array([share, rng.uniform(1.0, 6.0)]))
+    setup.change_wall(relaxing=np.array([share, rng.uniform(1.0, 6.0)]))
 
 
 def _misalignment(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    length = _length(setup)
-    turn = 0.012 * strength * random_direction(rng)
-    shift = 0.004 * strength * length * random_direction(rng)
-    _set(setup, misalignment=np.concatenate([turn, shift]))
+    setup.change(misalignment=misalignment(strength, _length(setup), rng))
 
 
 def _rate_dependence(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    _set_wall(setup, fluid=np.array([0.1 * strength, rng.uniform(0.4, 0.8)]))
+    setup.change_wall(fluid=np.array([0.1 * strength, rng.uniform(0.4, 0.8)]))
 
 
 def _contact(setup: Setup, strength: float, rng: np.random.Generator) -> None:
@@ -131,7 +102,7 @@ def _contact(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     deep = 0.3 * (1.0 - share) * length
     axis = np.cross(np.array([0.0, 0.0, 1.0]), way)
     stiffness = min(6.0 * strength, 12.0) / soft / math.sqrt(max(deep, 1e-3))
-    _set(setup, post=np.array([*centre, *(axis / np.linalg.norm(axis)), radius, stiffness]))
+    setup.change(post=np.array([*centre, *(axis / np.linalg.norm(axis)), radius, stiffness]))
 
 
 def _shape(plant: Plant, share: float, chamber: int) -> np.ndarray:
@@ -146,7 +117,7 @@ def _shape(plant: Plant, share: float, chamber: int) -> np.ndarray:
 
 
 def _softening(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    _set_wall(setup, damage=0.7 * (1.0 - math.exp(-0.6 * strength)))
+    setup.change_wall(damage=0.7 * (1.0 - math.exp(-0.6 * strength)))
 
 
 def _coupling(setup: Setup, strength: float, rng: np.random.Generator) -> None:
@@ -158,60 +129,58 @@ def _coupling(setup: Setup, strength: float, rng: np.random.Generator) -> None:
         part = i - i % ring
         for j in {part + (i + 1) % ring, part + (i - 1) % ring} - {i}:
             pressed[i, j] = 0.2 * strength * rng.uniform(0.8, 1.2)
-    _set(setup, pressed=pressed)
+    setup.change(pressed=pressed)
 
 
 def _dead_zone(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     m = len(setup.plant.areas)
-    _set(setup, unfold=0.03 * strength * setup.plant.high * rng.uniform(0.8, 1.2, m))
+    setup.change(unfold=0.03 * strength * setup.plant.high * rng.uniform(0.8, 1.2, m))
 
 
 def _drift(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    _set(setup, drift=0.03 * strength * _sideways(rng))
+    setup.change(drift=0.03 * strength * sideways(rng))
 
 
 def _stiffening(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    _set_wall(setup, locking=setup.plant.wall.locking + 0.08 * strength)
+    setup.change_wall(locking=setup.plant.wall.locking + 0.08 * strength)
 
 
 def _twist(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    _set(setup, fibre=0.06 * strength * rng.choice([-1.0, 1.0]))
+    setup.change(fibre=0.06 * strength * rng.choice([-1.0, 1.0]))
 
 
 def _thermal_drift(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    _set(setup, warmth=0.004 * strength)
+    setup.change(warmth=0.004 * strength)
 
 
 def _breathing(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    period = rng.uniform(3.0, 5.5)
-    shift = 0.02 * strength * _length(setup) * random_direction(rng)
-    _set(setup, breath=np.array([*shift, period, rng.uniform(0.0, period)]))
+    setup.change(breath=breath(strength, _length(setup), rng))
 
 
 def _stick_slip(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    _set(setup, stick=np.array([0.25 * strength, 0.05 * strength]))
+    setup.change(stick=np.array([0.25 * strength, 0.05 * strength]))
 
 
 def _knock(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    _set(setup, knock=np.append(0.02 * strength * _sideways(rng), rng.uniform(*EVENT_WINDOW_S)))
+    setup.change(knock=np.append(0.02 * strength * sideways(rng), rng.uniform(*EVENT_WINDOW_S)))
 
 
 def _tear(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     joint = int(rng.integers(0, len(setup.plant.mass) // 2))
     share = 0.8 * (1.0 - math.exp(-0.5 * strength))
-    _set(setup, tear=np.array([share, float(joint), rng.uniform(*EVENT_WINDOW_S)]))
+    setup.change(tear=np.array([share, float(joint), rng.uniform(*EVENT_WINDOW_S)]))
 
 
 def _marker_slip(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     key = int(rng.integers(len(setup.plant.keys)))
     way = 0.03 * strength * _length(setup) * rng.choice([-1.0, 1.0])
-    _set(setup, slip=np.array([way, float(key), rng.uniform(*EVENT_WINDOW_S)]))
+    setup.change(slip=np.array([way, float(key), rng.uniform(*EVENT_WINDOW_S)]))
 
 
 def _kinked_line(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     """The line of one chamber is nearly shut beyond a bending of the arm's lower third."""
     chamber = int(rng.integers(len(setup.plant.areas)))
-    _set(setup, kink=np.array([0.35, float(chamber), 0.02 / strength]))
+    setup.change(kink=np.array([0.35, float(chamber), 0.02 / strength]))
 
 
 def _snap_through(setup: Setup, strength: float, rng: np.random.Generator) -> None:
@@ -219,14 +188,14 @@ def _snap_through(setup: Setup, strength: float, rng: np.random.Generator) -> No
     it is nearly straight without what it snapped by."""
     joint, size = int(rng.integers(1, len(setup.plant.mass) // 2)), 2.0 * -math.expm1(-strength / 4)
     x, y = setup.plant.levers[int(rng.integers(3))]
-    _set(setup, snap=np.array([size, joint, 0.25, 0.05 + size, math.atan2(-x, y)]))
+    setup.change(snap=np.array([size, joint, 0.25, 0.05 + size, math.atan2(-x, y)]))
 
 
 def _dropout(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     """Spells of about half a second, some four a minute."""
     begin = np.cumsum(rng.exponential(15.0, 40))
     spells = np.stack([begin, begin + strength * rng.uniform(0.2, 0.8, 40)], axis=1)
-    _set(setup, dropouts=spells, vented=int(rng.integers(len(setup.plant.areas))))
+    setup.change(dropouts=spells, vented=int(rng.integers(len(setup.plant.areas))))
 
 
 HIDDEN: dict[str, Hidden[Setup]] = {

@@ -25,16 +25,13 @@ from benchmarks.chain.wall import (
     remember,
     wall_stress,
 )
+from benchmarks.generators import ROOM_C, rotation, since
 from surgisoft.compiled import compiled
 
 STEP_S = 0.01
 """Longest time step [s]."""
-ROOM_C = 22.0
-"""Temperature of the room at which an arm is at its nominal modulus [degrees Celsius]."""
 VENTED_S = 0.15
 """Time constant with which a chamber vents whose valve has no current [s]."""
-EVENT_S = 0.15
-"""Duration of a sudden event [s]."""
 
 
 class Plant(NamedTuple):
@@ -180,33 +177,6 @@ def warmed(time: float) -> float:
     if cycle >= 150.0:
         rising = top * math.exp(-(cycle - 150.0) / 90.0)
     return ROOM_C + 8.0 * rising
-
-
-@compiled
-def since(time: float, moment: float) -> float:
-    """Share of a sudden event that has happened at a time [s]."""
-    return min(max((time - moment) / EVENT_S, 0.0), 1.0)
-
-
-@compiled
-def rotation(turn: np.ndarray, out: np.ndarray) -> None:
-    """Rotation matrix (3, 3) of a rotation vector (3,) [rad] (Rodrigues 1840), into out."""
-    square = turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2
-    angle = math.sqrt(square)
-    if angle < 1e-6:
-        a, b = 1.0 - square / 6.0, 0.5 - square / 24.0
-    else:
-        a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / square
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = b * turn[i] * turn[j]
-        out[i, i] += 1.0 - b * square
-    out[2, 1] += a * turn[0]
-    out[1, 2] -= a * turn[0]
-    out[0, 2] += a * turn[1]
-    out[2, 0] -= a * turn[1]
-    out[1, 0] += a * turn[2]
-    out[0, 1] -= a * turn[2]
 
 
 @compiled

@@ -14,9 +14,8 @@ import numpy as np
 from benchmarks.chain.gas import Gas
 from benchmarks.chain.plant import Plant
 from benchmarks.chain.wall import Wall
+from benchmarks.generators import STANDARD_GRAVITY, Cameras, hanging
 
-STANDARD_GRAVITY = 9.80665
-"""[m/s^2] (CGPM 1901)."""
 STREAM = 0xC4A1
 """Number that tells this generator's draws from those of other rigs with the same seed."""
 LINKS = 18
@@ -49,26 +48,6 @@ BUILDS = (
 
 
 @dataclass(frozen=True)
-class Cameras:
-    """Motion capture."""
-
-    period_s: float
-    """Time between frames [s]."""
-    white_mm: float
-    """Standard deviation of a coordinate, new in each frame [mm]."""
-    slow_mm: float
-    """Standard deviation of its slow part, an AR(1) process [mm]."""
-    slow_s: float
-    """Correlation time of the slow part [s]."""
-    dropped: float
-    """Share of frames that are lost, in bursts [-]."""
-    burst_s: float
-    """Mean duration of a burst [s]."""
-    hidden: float
-    """Share of frames in which one key point is hidden from the cameras [-]."""
-
-
-@dataclass(frozen=True)
 class Robot:
     """A robot as it was built."""
 
@@ -80,6 +59,8 @@ class Robot:
     """Lower limit of pressure [Pa]; below 0 with a vacuum line."""
     length_mm: float
     """Length [mm]."""
+    radius_mm: float
+    """Radius [mm]."""
 
 
 def build_of(seed: int) -> Build:
@@ -95,7 +76,7 @@ def make_robot(seed: int) -> Robot:
     length = rng.uniform(0.25, 0.4) if segments == 2 else rng.uniform(0.15, 0.28)
     radius = length / segments / rng.uniform(7.0, 10.0)
     density = rng.uniform(700.0, 1100.0)
-    down = _hanging(rng)
+    down = hanging(rng)
     link, area = length / n, math.pi * radius**2
     second = math.pi * radius**4 / 4.0
     # Weight over bending stiffness of the whole arm: hanging arms may be softer than lying ones.
@@ -181,10 +162,4 @@ def make_robot(seed: int) -> Robot:
         hidden=rng.uniform(0.002, 0.02) if rng.random() < 0.5 else 0.0,
     )
     vacuum = -1e3 * round(rng.uniform(0.1, 0.25) * high / 1e3) if rng.random() < 0.3 else 0.0
-    return Robot(plant, cameras, vacuum, 1e3 * length)
-
-
-def _hanging(rng: np.random.Generator) -> np.ndarray:
-    """(3,) direction of weight of an arm that hangs tilted by up to 95 degrees."""
-    tilt, around = np.radians(rng.uniform(0.0, 95.0)), rng.uniform(0, 2 * np.pi)
-    return np.array([np.sin(tilt) * np.cos(around), np.sin(tilt) * np.sin(around), np.cos(tilt)])
+    return Robot(plant, cameras, vacuum, 1e3 * length, 1e3 * radius)

@@ -35,35 +35,16 @@ and `lens` (radial distortion of the cameras).
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks.generators import EVENT_WINDOW_S, Setup, breath, misalignment, sideways
 from benchmarks.lattice.body import ALONG, LEFT, RIB, RIGHT
 from benchmarks.lattice.gas import VOLUMES
 from benchmarks.lattice.motion import new_state, settle
 from benchmarks.lattice.plant import Plant
 from benchmarks.lattice.robot import SLABS, STREAM
 from surgisoft.rig.hidden import Hidden, random_direction, switch_on_from
-
-EVENT_WINDOW_S = (20.0, 130.0)
-"""Window of time since switching on in which an event that occurs once falls [s]."""
-
-
-@dataclass
-class Setup:
-    """What a hidden effect may change."""
-
-    plant: Plant
-    """Parameters of the robot; their arrays are shared, and replaced, not written to."""
-
-
-def _set(setup: Setup, **values) -> None:
-    setup.plant = setup.plant._replace(**values)
-
-
-def _set_wall(setup: Setup, **values) -> None:
-    _set(setup, wall=setup.plant.wall._replace(**values))
 
 
 def _length(plant: Plant) -> float:
@@ -79,12 +60,6 @@ def _radius(plant: Plant) -> float:
 def _section(plant: Plant) -> int:
     """Nodes in a cross-section."""
     return 1 + 3 * len(plant.body.faces)
-
-
-def _sideways(rng: np.random.Generator) -> np.ndarray:
-    """(3,) random unit vector across the arm."""
-    angle = rng.uniform(0, 2 * np.pi)
-    return np.array([math.cos(angle), math.sin(angle), 0.0])
 
 
 def _last_wall_node(plant: Plant, rng: np.random.Generator) -> int:
@@ -115,12 +90,12 @@ def _compliance(plant: Plant) -> float:
 def _payload(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     mass = setup.plant.mass.copy()
     mass[_last_wall_node(setup.plant, rng)] += 0.06 * strength * float(mass.sum())
-    _set(setup, mass=mass)
+    setup.change(mass=mass)
 
 
 def _hysteresis(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     limit, way = setup.plant.wall.friction
-    _set_wall(setup, friction=np.array([limit + 0.05 * strength, way * rng.uniform(0.8, 2.0)]))
+    setup.change_wall(friction=np.array([limit + 0.05 * strength, way * rng.uniform(0.8, 2.0)]))
 
 
 def _gain_mismatch(setup: Setup, strength: float, rng: np.random.Generator) -> None:
@@ -128,28 +103,26 @@ def _gain_mismatch(setup: Setup, strength: float, rng: np.random.Generator) -> N
     two = rng.permutation(len(gains))[:2]
     for chamber, share in zip(two, (0.06, -rng.uniform(0.0, 0.04)), strict=True):
         gains[chamber] *= math.exp(strength * share * rng.choice([-1.0, 1.0]))
-    _set(setup, gains=gains)
+    setup.change(gains=gains)
 
 
 def _line_lag(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     """Capillaries so narrow that a chamber follows within some tenths of a second."""
     line = 20.0 / strength * rng.uniform(0.7, 1.3, len(setup.plant.gains))
-    _set(setup, gas=setup.plant.gas._replace(line=line))
+    setup.change(gas=setup.plant.gas._replace(line=line))
 
 
 def _creep(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    _set_wall(setup, creep=0.15 * strength)
+    setup.change_wall(creep=0.15 * strength)
 
 
 def _misalignment(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    turn = 0.012 * strength * random_direction(rng)
-    shift = 0.004 * strength * _length(setup.plant) * random_direction(rng)
-    _set(setup, misalignment=np.concatenate([turn, shift]))
+    setup.change(misalignment=misalignment(strength, _length(setup.plant), rng))
 
 
 def _rate_dependence(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     more = np.array([0.4 * strength, rng.uniform(0.3, 1.0), rng.uniform(0.5, 2.0)])
-    _set_wall(setup, fluid=np.array([setup.plant.wall.fluid[0] + more[0], *more[1:]]))
+    setup.change_wall(fluid=np.array([setup.plant.wall.fluid[0] + more[0], *more[1:]]))
 
 
 def _contact(setup: Setup, strength: float, rng: np.random.Generator) -> None:
@@ -169,45 +142,43 @@ def _contact(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     centre = middle + (touched + radius + _radius(plant)) * way
     # As stiff as the arm several times, shared by the nodes of a few cross-sections.
     stiffness = min(4.0 * strength, 10.0) / _compliance(plant)
-    _set(setup, ball=np.array([*centre, radius, stiffness]))
+    setup.change(ball=np.array([*centre, radius, stiffness]))
 
 
 def _softening(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    _set_wall(setup, damage=0.6 * -math.expm1(-0.4 * strength))
+    setup.change_wall(damage=0.6 * -math.expm1(-0.4 * strength))
 
 
 def _coupling(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     soft = np.where(setup.plant.body.kinds == RIB, 1.0 / (1.0 + 4.0 * strength), 1.0)
-    _set(setup, rigidity=setup.plant.rigidity * soft)
+    setup.change(rigidity=setup.plant.rigidity * soft)
 
 
 def _dead_zone(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    _set(setup, loose=0.06 * strength * setup.plant.high)
+    setup.change(loose=0.06 * strength * setup.plant.high)
 
 
 def _drift(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    _set(setup, drift=0.025 * strength * _sideways(rng))
+    setup.change(drift=0.025 * strength * sideways(rng))
 
 
 def _stiffening(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    _set_wall(setup, threads=setup.plant.wall.threads + 0.3 * strength)
+    setup.change_wall(threads=setup.plant.wall.threads + 0.3 * strength)
 
 
 def _twist(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     share = math.tanh(0.3 * strength) * rng.choice([-1.0, 1.0])
     kinds = setup.plant.body.kinds
     more = 1.0 + share * ((kinds == RIGHT).astype(float) - (kinds == LEFT))
-    _set(setup, rigidity=setup.plant.rigidity * more)
+    setup.change(rigidity=setup.plant.rigidity * more)
 
 
 def _thermal_drift(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    _set(setup, warmth=strength * np.array([8e-3, rng.uniform(1e-4, 3e-4)]))
+    setup.change(warmth=strength * np.array([8e-3, rng.uniform(1e-4, 3e-4)]))
 
 
 def _breathing(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    period = rng.uniform(3.0, 5.5)
-    shift = 0.02 * strength * _length(setup.plant) * random_direction(rng)
-    _set(setup, breath=np.array([*shift, period, rng.uniform(0.0, period)]))
+    setup.change(breath=breath(strength, _length(setup.plant), rng))
 
 
 def _stick_slip(setup: Setup, strength: float, rng: np.random.Generator) -> None:
@@ -217,36 +188,36 @@ def _stick_slip(setup: Setup, strength: float, rng: np.random.Generator) -> None
     anchor = 1.5 * plant.body.nodes[node] * np.array([1.0, 1.0, 0.0])
     stiffness = 2.0 * (_radius(plant) / _length(plant)) ** -2 / _compliance(plant)
     slides = 0.01 * strength * _length(plant) / _compliance(plant) * 4.0
-    _set(setup, guide=np.array([*anchor, node, stiffness, slides, 0.3 * slides]))
+    setup.change(guide=np.array([*anchor, node, stiffness, slides, 0.3 * slides]))
 
 
 def _clamp_slip(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     shift = -0.006 * strength * _length(setup.plant)
     roll = 0.03 * strength * rng.choice([-1.0, 1.0])
-    _set(setup, slip=np.array([shift, roll, rng.uniform(*EVENT_WINDOW_S)]))
+    setup.change(slip=np.array([shift, roll, rng.uniform(*EVENT_WINDOW_S)]))
 
 
 def _buckling(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     """One side of the wall over three slabs of the lower half."""
     plant, section = setup.plant, _section(setup.plant)
-    side, slab = _sideways(rng), int(rng.integers(0, 3))
+    side, slab = sideways(rng), int(rng.integers(0, 3))
     ends = plant.body.ends
     outside = (plant.body.nodes[ends] @ side).min(axis=1) > 0.5 * _radius(plant)
     there = (ends[:, 0] >= slab * section) & (ends[:, 0] < (slab + 3) * section)
     patch = outside & there & (plant.body.kinds == ALONG)
     size = 2.0 * -math.expm1(-0.5 * strength)
     # Shorter by itself, a spring that has buckled returns only when it is stretched.
-    _set(setup, patch=patch.astype(float), buckling=np.array([size, -0.25, 0.1]))
+    setup.change(patch=patch.astype(float), buckling=np.array([size, -0.25, 0.1]))
 
 
 def _heat_step(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    _set(setup, heat=np.array([0.08 * strength, rng.uniform(*EVENT_WINDOW_S)]))
+    setup.change(heat=np.array([0.08 * strength, rng.uniform(*EVENT_WINDOW_S)]))
 
 
 def _leak(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     chamber = int(rng.integers(len(setup.plant.gains)))
     growing = 1e-3 * strength * setup.plant.gas.line[chamber] / VOLUMES
-    _set(setup, gas=setup.plant.gas._replace(leak=np.array([growing, chamber])))
+    setup.change(gas=setup.plant.gas._replace(leak=np.array([growing, chamber])))
 
 
 def _cable(setup: Setup, strength: float, rng: np.random.Generator) -> None:
@@ -256,14 +227,14 @@ def _cable(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     anchor = 1.3 * plant.body.nodes[node] * np.array([1.0, 1.0, 0.0])
     free = float(np.median(np.linalg.norm(shapes[:, node] - anchor, axis=1)))
     rigidity = 0.05 * strength * (_length(plant) / _radius(plant)) ** 2 / _compliance(plant) * free
-    _set(setup, cable=np.array([*anchor, node, free, rigidity]))
+    setup.change(cable=np.array([*anchor, node, free, rigidity]))
 
 
 def _lens(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     length = _length(setup.plant)
     centre = np.array([0.0, 0.0, 0.5 * length]) + 0.2 * length * random_direction(rng)
     bent = 0.04 * strength * rng.choice([-1.0, 1.0]) / (0.5 * length) ** 2
-    _set(setup, lens=np.array([*_sideways(rng), *centre, bent]))
+    setup.change(lens=np.array([*sideways(rng), *centre, bent]))
 
 
 HIDDEN: dict[str, Hidden[Setup]] = {

@@ -5,8 +5,9 @@ import math
 import numpy as np
 from scipy.linalg import lapack
 
+from benchmarks.generators import ROOM_C
 from benchmarks.lattice.gas import VOLUMES, fill
-from benchmarks.lattice.plant import ROOM_C, Plant, State, follow, load, room, see
+from benchmarks.lattice.plant import Plant, State, follow, load, room, see
 from benchmarks.lattice.wall import forget, new_memory
 from surgisoft.errors import InputError
 

@@ -14,15 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from benchmarks.generators import rotation, since
 from benchmarks.lattice.body import ALONG, Body
 from benchmarks.lattice.gas import VOLUMES, Gas
 from benchmarks.lattice.wall import Memory, Wall, remember, slope, stress
 from surgisoft.compiled import compiled
-
-ROOM_C = 22.0
-"""Temperature of the room at which an arm has its nominal modulus [degrees Celsius]."""
-EVENT_S = 0.15
-"""Duration of a sudden event [s]."""
 
 
 class Plant(NamedTuple):
@@ -117,33 +113,6 @@ def room(time: float) -> float:
     """Temperature of the room above the nominal one [K]: it warms, and the sun comes and goes."""
     late = max(time, 0.0)
     return 0.01 * late + 4.0 * (1.0 - math.cos(2.0 * math.pi * late / 260.0))
-
-
-@compiled
-def since(time: float, moment: float) -> float:
-    """Share of a sudden event that has happened at a time [s]."""
-    return min(max((time - moment) / EVENT_S, 0.0), 1.0)
-
-
-@compiled
-def rotation(turn: np.ndarray, out: np.ndarray) -> None:
-    """Rotation matrix (3, 3) of a rotation vector (3,) [rad] (Rodrigues 1840), into out."""
-    square = turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2
-    angle = math.sqrt(square)
-    if angle < 1e-6:
-        a, b = 1.0 - square / 6.0, 0.5 - square / 24.0
-    else:
-        a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / square
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = b * turn[i] * turn[j]
-        out[i, i] += 1.0 - b * square
-    out[2, 1] += a * turn[0]
-    out[1, 2] -= a * turn[0]
-    out[0, 2] += a * turn[1]
-    out[2, 0] -= a * turn[1]
-    out[1, 0] += a * turn[2]
-    out[0, 1] -= a * turn[2]
 
 
 @compiled

@@ -11,15 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
-from benchmarks.chain.robot import Cameras
+from benchmarks.generators import STANDARD_GRAVITY, Cameras, hanging
 from benchmarks.lattice.body import ALONG, RIGIDITY, make_body
 from benchmarks.lattice.gas import VOLUMES, Gas
 from benchmarks.lattice.motion import new_state, settle
 from benchmarks.lattice.plant import Plant
 from benchmarks.lattice.wall import Wall
 
-STANDARD_GRAVITY = 9.80665
-"""[m/s^2] (CGPM 1901)."""
 STREAM = 0x1A77
 """Number that tells this generator's draws from those of other rigs with the same seed."""
 SLABS = 12
@@ -113,7 +111,7 @@ def make_robot(seed: int) -> Robot:
     uneven *= np.exp(rng.normal(0.0, 0.04, count))
     reach = math.radians(rng.uniform(35.0, 55.0))  # of a segment under one chamber
     high = 1e3 * round(rng.uniform(12.0, 30.0)) * 5.0
-    down = _hanging(rng)
+    down = hanging(rng)
     chambers = [
         (i % ring, i // ring * SLABS // segments, (i // ring + 1) * SLABS // segments)
         for i in range(m)
@@ -189,9 +187,3 @@ def make_robot(seed: int) -> Robot:
 def _scaled(plant: Plant, rigidity: float) -> Plant:
     """The plant with springs of another rigidity along the arm [N]."""
     return plant._replace(rigidity=plant.rigidity * rigidity)
-
-
-def _hanging(rng: np.random.Generator) -> np.ndarray:
-    """(3,) direction of weight of an arm that hangs tilted by up to 95 degrees."""
-    tilt, around = np.radians(rng.uniform(0.0, 95.0)), rng.uniform(0, 2 * np.pi)
-    return np.array([np.sin(tilt) * np.cos(around), np.sin(tilt) * np.sin(around), np.cos(tilt)])

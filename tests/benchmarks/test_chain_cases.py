@@ -12,7 +12,7 @@ from benchmarks import rig_cases
 from benchmarks.chain.gas import AMBIENT_PA, CHOKED, Gas, discharge, fill, flow
 from benchmarks.chain.hidden import HIDDEN
 from benchmarks.chain.plant import move, new_state, place_links
-from benchmarks.chain.rig import ChainRig, camera_noise, drop_frames
+from benchmarks.chain.rig import ChainRig
 from benchmarks.chain.robot import BUILDS, make_robot
 from benchmarks.chain.wall import (
     DAMAGE_ENERGY,
@@ -171,13 +171,13 @@ def test_a_chamber_fills_at_a_constant_rate_while_the_flow_is_choked():
 def test_noise_and_dropped_frames_are_those_of_the_cameras():
     cameras = make_robot(601).cameras
     rng = np.random.default_rng(1)
-    noise = camera_noise(cameras, 20_000, 3, rng)
+    noise = cameras.noise(20_000, 3, rng)
     assert np.std(noise) == pytest.approx(math.hypot(cameras.white_mm, cameras.slow_mm), rel=0.03)
     lag = np.mean(noise[1:] * noise[:-1])
     keep = math.exp(-cameras.period_s / cameras.slow_s)
     assert lag == pytest.approx(keep * cameras.slow_mm**2, rel=0.2)
     assert cameras.dropped > 0.0
-    drop_frames(cameras, noise, rng)
+    cameras.drop_frames(noise, rng)
     lost = np.isnan(noise).any(axis=2).all(axis=1).mean()
     assert lost == pytest.approx(cameras.dropped, rel=0.4)
 

@@ -7,10 +7,11 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 
 from benchmarks import rig_cases
+from benchmarks.generators import Setup
 from benchmarks.lattice import motion
 from benchmarks.lattice.body import CORE, RIGIDITY, make_body
 from benchmarks.lattice.gas import AMBIENT_PA, VOLUMES, Gas, fill
-from benchmarks.lattice.hidden import HIDDEN, Setup, switch_on
+from benchmarks.lattice.hidden import HIDDEN, switch_on
 from benchmarks.lattice.motion import new_state, settle
 from benchmarks.lattice.plant import load, see
 from benchmarks.lattice.rig import LatticeRig

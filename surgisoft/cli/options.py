@@ -242,8 +242,8 @@ Refit = Annotated[
     Option(
         "--refit",
         help="Fit candidate effects together with the network; held-out runs decide. auto: only if "
-        "the error is far above the noise floor but no larger than the model's validated error, as "
-        "happens if the network has learned to imitate a lag. Takes minutes.",
+        "the error is far above the noise floor but about as large as the model's validated error, "
+        "as happens if the network has learned to imitate a lag. Takes minutes.",
     ),
 ]
 REFIT_PROCESSES = min(2, os.cpu_count() or 1)

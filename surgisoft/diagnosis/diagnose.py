@@ -10,8 +10,9 @@ the diagnosis ends there. Else it is a system identification of a grey-box model
    are named one by one while they are beyond chance and large enough (`selection`).
 4. Decision: calibrated probabilities from the evidence, and the result that is worth most with
    them (`evidence`, `decision`).
-5. Refit: where the error is large and no larger than the validated one, candidates are fitted
-   together with the network, and held-out data decide (`refit`).
+5. Refit: where the error is large and no larger than the validated one, or the network has learned
+   part of what is missing, candidates are fitted together with it, and held-out data decide
+   (`refit`).
 6. Experiment design, where effects cannot be told apart (`design`).
 """
 
@@ -87,7 +88,7 @@ REASONS = {
     "network": "a function of the actuation alone explains most of the error, which is larger than "
     "the model's validated error, so the model does not describe this arm: fit a model to these "
     "recordings",
-    "learned": "the error is no larger than the model's validated error, and a black box with "
+    "learned": "the error is about as large as the model's validated error, and a black box with "
     "memory explains a part of it that no static function explains, so the network has learned "
     "part of the missing effect: fit a network together with effects",
     "repeatability": "most probably nothing has changed, but the change is not clearly as small as "
@@ -314,6 +315,8 @@ def diagnose(
     else:
         found, not_testable = findings_of(problem, report, without)
         result = replace(result_of(found), not_testable=not_testable)
+        if not reason and refit == "auto" and model.trainable:
+            reason = reason_of_result(result.verdict)
         if reason:
             cannot = [*without, *(each.effect for each in not_testable)]
             joint = fit_candidates_together(
@@ -326,6 +329,16 @@ def diagnose(
         unknown = not held_out_in_fit(model, whole, table.held_out)
         result = replace(result, next_command=amend_command(result, unknown))
     return replace(result, notes=notes, seconds=time.perf_counter() - begin)
+
+
+def reason_of_result(verdict: Verdict) -> str:
+    """Why candidates are fitted together with the network after all; empty where they are not.
+
+    Where the residuals cannot tell because the network has learned a part of what is missing, only
+    a fit of both can.
+    """
+    learned = verdict.kind == "cannot_tell" and verdict.reason == "learned"
+    return "the network has learned part of what is missing" if learned else ""
 
 
 def diagnose_change(

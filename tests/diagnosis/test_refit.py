@@ -210,6 +210,28 @@ def test_never_does_not_refit_where_auto_would(lagging, monkeypatch):
     assert found.to_json()["refit"] is None
 
 
+@pytest.mark.parametrize(
+    ("why", "mode", "effects"),
+    [
+        ("learned", "auto", ("line_lag",)),
+        ("learned", "never", ()),
+        ("schedule", "auto", ()),
+    ],
+)
+def test_what_the_network_has_learned_leads_to_a_refit(
+    lagging, found, monkeypatch, why, mode, effects
+):
+    """Where the error is larger than auto asks for, but residuals cannot tell for this reason."""
+    recording, model = lagging
+    off = model.replace(validation=Validation(0.1, (0.1,) * model.spec.key_points, 300))
+    none = replace(named(None, found), verdict=Verdict("cannot_tell", (), "why", 0.5, why))
+    monkeypatch.setattr(diagnosing, "result_of", lambda findings: none)
+    monkeypatch.setattr(diagnosing, "fit_candidates_together", lambda *given, **more: found)
+    result = diagnosing.diagnose(off, [recording], refit=mode, setup_tests=False)
+    assert result.verdict.effects[:1] == effects
+    assert (result.refit is found) == bool(effects)
+
+
 def test_an_error_beyond_the_validated_one_is_left_to_the_residuals(problem):
     """Something has changed since the fit: the network cannot have learned it."""
     model = problem.model.replace(

@@ -119,6 +119,11 @@ def _fall(judged: list[Outcome]) -> str:
     return text + ")"
 
 
+def _best_gain(outcome: Outcome) -> float:
+    """Share of what can be explained that the best effect of the list explains alone."""
+    return max((one["gain"] for one in outcome.statistics["effects"]), default=0.0)
+
+
 def outside(outcomes: list[Outcome]) -> str:
     """Verdicts on effects outside the list, and how well the nearest known one imitates them."""
     kinds: dict[str, list[Outcome]] = {}
@@ -134,7 +139,7 @@ def outside(outcomes: list[Outcome]) -> str:
     for name, some in sorted(kinds.items()):
         called = sum(o.kind == "unknown_effect" for o in some)
         nearest = Counter(o.ranking[0] for o in some if o.ranking).most_common(1)
-        share = np.median([o.statistics.get("gain", 0.0) for o in some])
+        share = np.median([_best_gain(o) for o in some])
         lines.append(
             f"| {name} | {called} of {len(some)} | {nearest[0][0] if nearest else ''} "
             f"| {100 * share:.0f} % |"

@@ -6,7 +6,7 @@ import os
 import shutil
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 
 import numpy as np
 import pytest
@@ -30,6 +30,7 @@ from surgisoft.diagnosis.diagnose import (
     effect_left,
     rivals_of,
 )
+from surgisoft.diagnosis.evidence import EffectEvidence, Evidence
 from surgisoft.rig.hidden import HIDDEN
 from surgisoft.surrogate.checkpoint import DEFAULT_FOLDER, default_arm
 
@@ -241,7 +242,15 @@ def said(
     **more,
 ):
     effects = ranking[:1] if named else ()
-    return Outcome(case, kind, effects, ranking, confidence, 0.5, 0.1, 2.0, {}, **more)
+    return Outcome(case, kind, effects, ranking, confidence, 0.5, 0.1, 2.0, {"effects": []}, **more)
+
+
+def explains(*gains: float) -> dict:
+    """The evidence of a diagnosis, as far as the tables read it; `Evidence` has these names."""
+    found = {each.name for each in fields(Evidence)}, {each.name for each in fields(EffectEvidence)}
+    assert "effects" in found[0]
+    assert "gain" in found[1]
+    return {"effects": [{"effect": str(n), "gain": gain} for n, gain in enumerate(gains)]}
 
 
 def test_table_counts():
@@ -338,10 +347,9 @@ def test_falls_are_counted_as_shares_of_the_oracles():
 
 def test_effects_outside_the_list_are_counted_by_kind():
     leaks = [replace(CLEAN, hidden=(("leak", size),)) for size in (1.0, 2.0)]
+    unknown = said(leaks[0], "unknown_effect", ("coupling",), 0.0, False)
     some = [
-        replace(
-            said(leaks[0], "unknown_effect", ("coupling",), 0.0, False), statistics={"gain": 0.2}
-        ),
-        replace(said(leaks[1], "identified", ("coupling",), 0.9), statistics={"gain": 0.8}),
+        replace(unknown, statistics=explains(0.2, 0.1)),
+        replace(said(leaks[1], "identified", ("coupling",), 0.9), statistics=explains(0.1, 0.8)),
     ]
     assert "| leak | 1 of 2 | coupling | 50 % |" in markdown(some)

@@ -5,8 +5,8 @@
 
 `benchmarks.rig_cases` describes the folder (such as runs/mujoco, outside git) and the plans, and
 `benchmarks.mujoco_arm` the physics. Changes are drawn in mm for each 100 mm of the arm.
-`robot.json` has one field more, `fit`: the budget of the fit of the robot's model. MuJoCo is the
-extra `mujoco`.
+`robot.json` has one field more, `fit`: the budget of the fit of the robot's model. MuJoCo is no
+dependency: `pip install 'mujoco>=3.9,<4'`.
 """
 
 from benchmarks.generators import generator

@@ -7,8 +7,8 @@ models:
 | effect | law here | in the arm model |
 |---|---|---|
 | `payload` | a body on the rim of the tip: a weight coincides | beam, to first order |
-| `hysteresis` | MuJoCo's dry friction in the joints: with its spring each is a play operator of the \
-joint's couple, which coincides in form | play operators on chambers |
+| `hysteresis` | MuJoCo's dry friction in the joints: with its spring each is a play operator \
+of the joint's couple, which coincides in form | play operators on chambers |
 | `gain_mismatch` | two chambers of other areas: a factor coincides | gain |
 | `line_lag` | MuJoCo's muscle activation, filling unlike venting (Millard et al. 2013) | one lag, \
 laminar to turbulent |
@@ -28,12 +28,12 @@ exponential (Fung) of loads |
 | `thermal_drift` | stiffness by a power of absolute temperature, weight included | gain by \
 temperature |
 
-Unknown ones are `breathing` (the base is moved; a quick breath in, and a slow one out), `stick_slip`
-(a hose from the tip to a slider with dry friction, static above kinetic), `cable` (slack, and
-elastic from one length on), `leak` (a seal that lifts in spells), `loose_mount` (a base with play
-in all directions), `wind` (gusts), `snag` (from one moment on a hose holds the tip back) and
-`delamination` (from one moment on a chamber pushes on less of its area over
-the last two thirds of its length).
+Unknown ones are `breathing` (the base is moved; a quick breath in, and a slow one out),
+`stick_slip` (a hose from the tip to a slider with dry friction, static above kinetic), `cable`
+(slack, and elastic from one length on), `leak` (a seal that lifts in spells), `loose_mount` (a base
+with play in all directions), `wind` (gusts), `snag` (from one moment on a hose holds the tip back)
+and `delamination` (from one moment on a chamber pushes on less of its area over the last two thirds
+of its length).
 """
 
 import math

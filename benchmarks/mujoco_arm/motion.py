@@ -275,7 +275,7 @@ class Arm:
         self.model.jnt_stiffness[self._ball] = self._stiffness * (1.0 - self.plant.damage * worn)
 
     def push(self, air: np.ndarray) -> np.ndarray:
-        """(m,) push of each chamber at pressures (m,) over the limit, over that at the limit [-]."""
+        """(m,) push of chambers at pressures (m,) over the limit, over that at the limit [-]."""
         plant, pushed = self.plant, air.copy()
         if plant.touch > 0.0:
             # Parts of a bladder touch at pressures that are distributed exponentially.

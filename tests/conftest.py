@@ -14,6 +14,7 @@ that is run. The times of tests that are not run stay as they are, so that a sin
 measured.
 """
 
+import gc
 import os
 from collections import defaultdict
 from pathlib import Path
@@ -54,6 +55,14 @@ def pytest_collection_modifyitems(items):
     for item in items:
         item.add_marker(pytest.mark.slow if _function(item) in slow else pytest.mark.fast)
     items.sort(key=lambda item: -work[item.nodeid.partition("::")[0]])
+
+
+def pytest_collection_finish():
+    """Look for cycles among new objects only: libraries and tests are some million objects that
+    stay to the end."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(10_000, 20, 20)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -243,7 +243,8 @@ def decision(
         write_atomically(asset, json.dumps(values, indent=1) + "\n")
         print(f"wrote {asset}")
     table = markdown(some, values, aside, each_robot)
-    _show("Decision results", values["command"], table, output)
+    command = values["command"] + (" --each-robot" if each_robot else "")
+    _show("Decision results", command, table, output)
 
 
 @app.command("setup-faults")

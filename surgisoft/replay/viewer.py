@@ -91,15 +91,20 @@ def running(*arguments: str, quiet: bool = True) -> Iterator[subprocess.Popen]:
         _end(process)
 
 
+def check_alive(process: subprocess.Popen) -> None:
+    """Raise an InputError if the viewer has ended, as it does where it has nothing to draw with."""
+    if process.poll() is not None:
+        raise InputError(
+            f"the Rerun viewer ended with code {process.returncode}; without a display it "
+            "needs a Vulkan driver (Debian: mesa-vulkan-drivers)"
+        )
+
+
 def wait_for_port(process: subprocess.Popen, port: int, patience_s: float = 30.0) -> None:
     """Wait until the viewer listens on the port; an InputError if it ends or takes too long."""
     end = time.monotonic() + patience_s
     while time.monotonic() < end:
-        if process.poll() is not None:
-            raise InputError(
-                f"the Rerun viewer ended with code {process.returncode}; without a display it "
-                "needs a Vulkan driver (Debian: mesa-vulkan-drivers)"
-            )
+        check_alive(process)
         with contextlib.suppress(OSError), socket.create_connection((LOCAL, port), 0.2):
             return
         time.sleep(0.05)
@@ -246,23 +251,34 @@ def take_screenshot(
     arguments = (str(recording), "--bind", LOCAL, "--port", str(port), "--headless")
     with running(*arguments, "--window-size", f"{size[0]}x{size[1]}") as viewer:
         wait_for_port(viewer, port)
-        write_atomically(picture, _draw(port, view, cursor, max(size), wait_s))
+        write_atomically(picture, _draw(viewer, port, view, cursor, max(size), wait_s))
 
 
-def _draw(port: int, view: str | None, cursor, max_size: int, wait_s: float) -> bytes:
-    """The picture from the running viewer, after its views and their data are loaded."""
+def _draw(
+    viewer: subprocess.Popen,
+    port: int,
+    view: str | None,
+    cursor: tuple[str, float] | None,
+    max_size: int,
+    wait_s: float,
+) -> bytes:
+    """The picture from the running viewer, after its views and their data are loaded.
+
+    A viewer without a graphics driver listens on its port first and ends with its first frame.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         from rerun.experimental import ViewerClient
 
-        client = ViewerClient.connect(f"rerun+http://{LOCAL}:{port}/proxy")
         end = time.monotonic() + PATIENCE_S
-        found = None
+        client = found = None
         while found is None and time.monotonic() < end:
+            check_alive(viewer)
             with contextlib.suppress(Exception):
+                client = client or ViewerClient.connect(f"rerun+http://{LOCAL}:{port}/proxy")
                 found = next(v.view_id for v in client.get_state().views if view in (v.name, None))
             time.sleep(0.2)
-        if found is None:
+        if client is None or found is None:
             wanted = "no view" if view is None else f"no view '{view}'"
             raise InputError(f"the Rerun viewer shows {wanted} of the recording")
         if cursor is not None:

@@ -1,11 +1,13 @@
 """Which replay a path names, and a viewer that is slow to draw it."""
 
 import os
+import sys
 import time
 
 import pytest
 
 from surgisoft.errors import InputError
+from surgisoft.replay import viewer
 from surgisoft.replay.show import MAGIC, find_replay
 from surgisoft.replay.viewer import painted
 
@@ -38,3 +40,22 @@ def test_a_busy_viewer_is_asked_again_until_the_end():
     assert painted(Busy(2), "Scene", 1600, time.monotonic() + 60.0) == b"Scene 1600"
     with pytest.raises(InputError, match="drew no picture within 180 s"):
         painted(Busy(2), "Scene", 1600, time.monotonic() - 1.0)
+
+
+def test_a_viewer_that_cannot_draw_is_told_at_once(tmp_path, monkeypatch):
+    """Without a graphics driver the viewer listens on its port and ends with its first frame."""
+    program = tmp_path / "rerun"
+    program.write_text(
+        f"#!{sys.executable}\n"
+        "import socket, sys\n"
+        "port = int(sys.argv[sys.argv.index('--port') + 1])\n"
+        "socket.create_server(('127.0.0.1', port)).accept()\n"
+        "sys.exit(102)\n"
+    )
+    program.chmod(0o755)
+    monkeypatch.setattr(viewer, "viewer_command", lambda: str(program))
+    begin = time.monotonic()
+    with pytest.raises(InputError, match=r"ended with code 102.*mesa-vulkan-drivers"):
+        viewer.take_screenshot(tmp_path / "a.rrd", tmp_path / "a.png")
+    assert time.monotonic() - begin < 30.0
+    assert not (tmp_path / "a.png").exists()

@@ -258,7 +258,7 @@ def _draw(
     viewer: subprocess.Popen,
     port: int,
     view: str | None,
-    cursor: tuple[str, float] | None,
+    cursor: tuple[str, Any] | None,
     max_size: int,
     wait_s: float,
 ) -> bytes:

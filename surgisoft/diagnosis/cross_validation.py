@@ -355,8 +355,10 @@ class CrossValidation:
         key = sensitivities.tobytes()
         if key not in self.cache:
             rows = np.concatenate([[0], sensitivities + 1])
-            amplitudes = _amplitudes(self.grams[:, :, rows[:, None], rows])
-            losses = np.empty((*amplitudes.shape[:2], len(self.split.fold)))
+            levels, folds = self.grams.shape[:2]
+            amplitudes = np.empty((levels, len(RIDGES), folds, len(sensitivities)))
+            _solve(self.grams, rows, np.array(RIDGES), amplitudes)
+            losses = np.empty((levels, len(RIDGES), len(self.split.fold)))
             products = self.held_out
             _sum_squares(
                 products.first, products.further, rows, amplitudes, self.split.fold, losses
@@ -582,32 +584,64 @@ def _sum_squares(first, further, rows, amplitudes, fold, losses):
             least[:] = 0.0
             for i in range(size):
                 along[:] = 0.0
-                for j in range(size):
+                for j in range(i):
                     product = _pair(first, further, level, rows[i], rows[j])
                     for block in range(blocks):
                         along[block] += product[block] * mix[j, block]
                 own = _pair(first, further, level, rows[i], rows[i])
                 for block in range(blocks):
-                    total[block] += mix[i, block] * along[block]
-                    least[block] += own[block] * mix[i, block] * mix[i, block]
+                    square = own[block] * mix[i, block] * mix[i, block]
+                    total[block] += 2.0 * mix[i, block] * along[block] + square
+                    least[block] += square
             for block in range(blocks):
                 total[block] = max(total[block], ROUNDING * least[block])
 
 
-def _amplitudes(gram: np.ndarray) -> np.ndarray:
-    """(L, r, folds, k) least-squares amplitudes with each of r RIDGES.
+@compiled(reorder=True)
+def _solve(grams, rows, ridges, amplitudes):
+    """Write least-squares amplitudes with each of r ridges into amplitudes (L, r, folds, k).
 
-    gram: (L, folds, 1 + k, 1 + k) products of the residual and the sensitivities.
+    grams (L, folds, C, C): products of the residual, row 0, and the sensitivities; rows (1 + k,)
+    those that are looked at, 0 first. Normal matrices are scaled to a diagonal of 1 and factorised
+    as L D L' (Golub & Van Loan 2013, section 4.1).
     """
-    normal, right = gram[..., 1:, 1:], gram[..., 1:, 0]
-    normal = 0.5 * (normal + np.swapaxes(normal, -1, -2))
-    power = np.diagonal(normal, axis1=-2, axis2=-1)
-    least = np.maximum(power.max(axis=-1, initial=0.0, keepdims=True), 1e-30)
-    size = np.sqrt(np.maximum(power, 1e-12 * least))
-    scaled = normal / size[..., :, None] / size[..., None, :]
-    ridge = np.array(RIDGES)[:, None, None, None] * np.eye(normal.shape[-1])
-    answer = np.linalg.solve(scaled[:, None] + ridge, (right / size)[:, None, ..., None])
-    return answer[..., 0] / size[:, None]
+    levels, folds = grams.shape[:2]
+    count = len(rows) - 1
+    scaled, lower, size = np.empty((count, count)), np.empty((count, count)), np.empty(count)
+    row, pivot, found = np.empty(count), np.empty(count), np.empty(count)
+    for level in range(levels):
+        for number in range(folds):
+            gram = grams[level, number]
+            most = 1e-30
+            for i in range(count):
+                most = max(most, gram[rows[i + 1], rows[i + 1]])
+            for i in range(count):
+                size[i] = np.sqrt(max(gram[rows[i + 1], rows[i + 1]], 1e-12 * most))
+                for j in range(i + 1):
+                    one, other = rows[i + 1], rows[j + 1]
+                    both = 0.5 * (gram[one, other] + gram[other, one])
+                    scaled[i, j] = both / (size[i] * size[j])
+            for ridge in range(len(ridges)):
+                for i in range(count):
+                    for j in range(i):
+                        rest = scaled[i, j]
+                        for p in range(j):
+                            rest -= row[p] * lower[j, p]
+                        row[j] = rest
+                    rest = scaled[i, i] + ridges[ridge]
+                    value = gram[rows[i + 1], 0] / size[i]
+                    for j in range(i):
+                        lower[i, j] = row[j] / pivot[j]
+                        rest -= row[j] * lower[i, j]
+                        value -= lower[i, j] * found[j]
+                    pivot[i] = rest
+                    found[i] = value
+                for i in range(count):
+                    found[i] /= pivot[i]
+                for i in range(count - 1, -1, -1):
+                    for j in range(i):
+                        found[j] -= lower[i, j] * found[i]
+                    amplitudes[level, ridge, number, i] = found[i] / size[i]
 
 
 def split_of(problem: Problem) -> Split:

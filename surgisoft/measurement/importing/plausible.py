@@ -50,10 +50,10 @@ def _order(recording: Recording) -> list[str]:
     motion = []
     for k in range(recording.key_points):
         point = recording.key_points_mm[:, k]
-        seen = point[~np.isnan(point).any(axis=1)]
-        if len(seen) < 2:
+        seen = ~np.isnan(point[:, 0])  # missing ones are missing as a whole
+        if seen.sum() < 2:
             return []
-        motion.append(float(np.sqrt(np.square(seen - seen.mean(axis=0)).sum(axis=1).mean())))
+        motion.append(float(np.sqrt(sum(axis[seen].var() for axis in point.T))))
     falls = all(a > b for a, b in itertools.pairwise(motion))
     if len(motion) < 3 or not falls or motion[0] < BASE_MOTION * motion[-1]:
         return []

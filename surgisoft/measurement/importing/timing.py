@@ -169,7 +169,7 @@ def _on(grid: np.ndarray, t_s: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 def _seen_on(grid: np.ndarray, t_s: np.ndarray, point: np.ndarray, step: float) -> np.ndarray:
     """(G, 3) of a key point (T, 3), missing before, after and in long gaps of what is known."""
-    known = ~np.isnan(point).any(axis=1)
+    known = ~np.isnan(point[:, 0])  # missing ones are missing as a whole
     if known.sum() < 2:
         return np.full((len(grid), 3), np.nan)
     known_s = t_s[known]

@@ -277,13 +277,13 @@ class _Track:
     def _usual(self, first: np.ndarray) -> np.ndarray:
         """(C,) median of the steps in the window that begins at each of these, as far as known."""
         padded, usual = self._padded_mm, np.zeros(len(first))
-        for some in np.array_split(np.arange(len(first)), len(first) // 100_000 + 1):
-            windows = padded[first[some, None] + STEP_WINDOW + np.arange(STEP_WINDOW)]
-            whole = ~np.isnan(windows).any(axis=1)
-            usual[some[whole]] = np.median(windows[whole], axis=1)
-            for i, window in zip(some[~whole], windows[~whole], strict=True):
-                known = window[~np.isnan(window)]
-                usual[i] = np.median(known) if len(known) else 0.0
+        for start in range(0, len(first), 100_000):
+            some = np.arange(start, min(start + 100_000, len(first)))
+            windows = np.sort(padded[first[some, None] + STEP_WINDOW + np.arange(STEP_WINDOW)])
+            known = STEP_WINDOW - np.isnan(windows).sum(axis=1)  # missing ones are sorted last
+            each = np.arange(len(some))
+            middle = windows[each, (known - 1) // 2] + windows[each, known // 2]
+            usual[some] = np.where(known > 0, 0.5 * middle, 0.0)
         return usual
 
     @cached_property
@@ -305,13 +305,14 @@ def _track(points: np.ndarray, start: int) -> _Track:
     """The track of positions (R, 3) [mm] of a run that begins at sample `start`."""
     known = np.flatnonzero(~np.isnan(points[:, 0]))  # missing ones are missing as a whole
     fresh = known[_changes(points[known], np.zeros(len(known)))] if len(known) else known
-    steps = np.linalg.norm(np.diff(points[fresh], axis=0), axis=1)
+    moved = np.diff(points[fresh], axis=0)
+    steps = np.sqrt(np.einsum("ri,ri->r", moved, moved))
     return _Track(fresh + start, steps / np.diff(fresh) if len(fresh) > 1 else steps)
 
 
 def _motion_mm(points: np.ndarray) -> np.ndarray:
     """(n,) diagonal of the box that holds 98 % of each key point's positions (T, n, 3) [mm]."""
-    seen = ~np.isnan(points).any(axis=(0, 2)) | (~np.isnan(points).all(axis=0)).all(axis=1)
+    seen = (~np.isnan(points).all(axis=0)).all(axis=1)
     motion = np.zeros(points.shape[1])
     if seen.any():
         low, high = np.nanquantile(points[:, seen], [0.01, 0.99], axis=0)
@@ -479,10 +480,8 @@ def _times(recording: Recording) -> str:
 
 def _ranges(values: np.ndarray) -> str:
     """Least to largest of each column (T, c)."""
-    low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
-    return ", ".join(
-        f"{a:.4g}" if a == b else f"{a:.4g} to {b:.4g}" for a, b in zip(low, high, strict=True)
-    )
+    ends = [(np.nanmin(column), np.nanmax(column)) for column in values.T]
+    return ", ".join(f"{a:.4g}" if a == b else f"{a:.4g} to {b:.4g}" for a, b in ends)
 
 
 def _key_point(recording: Recording, j: int) -> str:
@@ -490,8 +489,9 @@ def _key_point(recording: Recording, j: int) -> str:
     missing = int(np.isnan(points[:, 0]).sum())  # missing ones are missing as a whole
     if missing == recording.samples:
         return f"  k{j}: missing in every row"
-    axes = zip("xyz", np.nanmin(points, axis=0), np.nanmax(points, axis=0), strict=True)
-    ranges = ", ".join(f"{axis} {a:.1f} to {b:.1f}" for axis, a, b in axes)
+    ends = [(np.nanmin(column), np.nanmax(column)) for column in points.T]
+    axes = zip("xyz", ends, strict=True)
+    ranges = ", ".join(f"{axis} {a:.1f} to {b:.1f}" for axis, (a, b) in axes)
     lost = f", missing in {missing} rows ({missing / recording.samples:.1%})" if missing else ""
     return f"  k{j} mm: {ranges}{lost}"
 

@@ -88,7 +88,9 @@ def _cleaned(body: bytes, role: FileRole) -> bytes:
         body = re.sub(rb"(?m)^[ \t]+|[ \t]+$", b"", body)
         return re.sub(rb"[ \t]+", b"\t", body)
     # A search for lines of blanks alone goes through every line, which few files need.
-    blank = body[:1] in (b" ", b"\t") or b"\n " in body or b"\n\t" in body
+    blank = any(
+        mark in body and (body.startswith(mark) or b"\n" + mark in body) for mark in (b" ", b"\t")
+    )
     if role.separator == "\t" or not blank:
         return body
     return re.sub(rb"(?m)^[ \t]+$", b"", body)

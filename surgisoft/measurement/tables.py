@@ -176,7 +176,13 @@ class DelimitedText:
             if b'"' in self.body or len(self.body) <= BLOCK_BYTES:
                 return self._numbers_by_cell(positions)
             return np.concatenate([block.numbers(positions) for block in self._blocks()])
-        return np.column_stack([c.to_numpy() for c in columns]).astype(np.float64, copy=False)
+        values = np.empty((len(columns[0]), len(columns)), order="F")  # a column lies together
+        for target, column in zip(values.T, columns, strict=True):
+            start = 0
+            for chunk in column.chunks:
+                target[start : start + len(chunk)] = chunk.to_numpy(zero_copy_only=False)
+                start += len(chunk)
+        return values
 
     def texts(self, position: int) -> list[str]:
         """Cells (T,) of a column as text, without surrounding spaces."""

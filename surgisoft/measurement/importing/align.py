@@ -161,6 +161,8 @@ def join(
             f"{main.path}: no row is left after joining the files, expected common rows or times; "
             + "; ".join(notes)
         )
+    if keep.all():
+        return Joined(main, rows, t_s, columns, notes)
     columns = {key: column[keep] for key, column in columns.items()}
     return Joined(main, rows[keep], t_s[keep], columns, notes)
 

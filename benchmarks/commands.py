@@ -199,6 +199,13 @@ def decision(
             help="The same, of cases that no fit uses: the fit to all others is tested on them.",
         ),
     ] = None,
+    include: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="Stored sources that no fit uses otherwise, to be fitted to as well.",
+        ),
+    ] = None,
     robots: Robots = "200,201,202,203,204,205",
     undertrained: Annotated[
         str, typer.Option(help="Robots among them that also get an undertrained model.")
@@ -233,11 +240,16 @@ def decision(
     from benchmarks.decision import own_rig
     from benchmarks.decision.study import Collected, run
     from benchmarks.decision.table import markdown
+    from surgisoft.errors import InputError
 
     check_folder(work)
+    if include and (keep or asset):
+        raise InputError(
+            "--include: not with --keep or --asset, which are of the decision in force"
+        )
     plan = own_rig.Plan(_numbers("--robots", robots), _numbers("--undertrained", undertrained))
     with _kept("decision", work) as report:
-        new = Collected(plan, count, seed, cases or [], judge or [])
+        new = Collected(plan, count, seed, cases or [], judge or [], include or [])
         some, aside, values = run(new, work, processes, report, keeps=keep)
     if asset:
         write_atomically(asset, json.dumps(values, indent=1) + "\n")

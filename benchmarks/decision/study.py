@@ -25,6 +25,8 @@ class Collected:
     """`NAME=FOLDER` of the other sources."""
     judged: Sequence[str] = ()
     """The same, of cases that take no part in any fit."""
+    included: Sequence[str] = ()
+    """Names of stored sources that otherwise take no part, and are fitted to here."""
 
     @property
     def command(self) -> str:
@@ -38,6 +40,7 @@ class Collected:
             words.append(f"--count {self.count} --seed {self.seed}")
         for option, given in (("--cases", self.sources), ("--judge", self.judged)):
             words += [f"{option} {name}={folder.name}" for name, folder in map(_source, given)]
+        words += [f"--include {name}" for name in self.included]
         return " ".join(words)
 
 
@@ -67,6 +70,11 @@ def run(
             target[name] = folders.run(
                 name, folder, work / "models", log, processes, report, off=fitted, twins=fitted
             )
+    for name in new.included:
+        if name not in aside:
+            known = ", ".join(sorted(aside)) or "none"
+            raise InputError(f"--include {name}: expected a source that is only judged: {known}")
+        every[name] = aside.pop(name)
     if not every:
         raise InputError(f"{evidence}: no stored evidence; give --count or --cases")
     if keeps:

@@ -432,6 +432,14 @@ def test_without_options_the_fit_is_to_the_stored_evidence(tmp_path):
     assert {name: one["cases"] for name, one in values["sources"].items()} == {"a": 40, "b": 30}
     assert values["command"] == "surgisoft benchmark decision"
     assert not (tmp_path / "work").exists()
+    new = Collected(Plan([1], []), included=["a_b"])
+    cases, aside, values = run(new, tmp_path / "work", 1, lambda *_: None, tmp_path)
+    assert (len(cases), len(aside)) == (80, 0)
+    assert values["sources"]["a_b"]["cases"] == 10
+    assert values["command"] == "surgisoft benchmark decision --include a_b"
+    new = Collected(Plan([1], []), included=["b"])
+    with pytest.raises(InputError, match="--include b: expected a source that is only judged: a_b"):
+        run(new, tmp_path / "work", 1, lambda *_: None, tmp_path)
 
 
 def test_without_any_evidence_the_message_says_what_to_do(tmp_path):

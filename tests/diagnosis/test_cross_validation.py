@@ -88,6 +88,21 @@ def test_losses_are_those_of_joint_fits(data, picked):
     assert found.losses(picked) == pytest.approx(min(tried, key=np.sum), rel=2e-4)
 
 
+def test_losses_of_collinear_columns_are_those_of_joint_fits(data):
+    """Columns that share most of their power, and the last one of which is weak."""
+    features, residual, columns, *rest = data
+    mix = np.array([[1.0, 0.9, 0.02], [0.0, 0.4, 0.03], [0.0, 0.0, 0.01]])
+    mixed = features, residual, columns @ mix, *rest
+    surrogate, noise = np.array([0.3, 0.5]), np.array([0.1, 0.1])
+    found = cross_validated(*mixed, surrogate, noise)
+    tried = [
+        brute(mixed, [0, 1, 2], rows, share, surrogate, noise)
+        for rows in PERSISTENCE
+        for share in RIDGES
+    ]
+    assert found.losses([0, 1, 2]) == pytest.approx(min(tried, key=np.sum), rel=2e-4)
+
+
 def test_the_right_column_has_its_amplitude(data):
     found = cross_validated(*data, np.array([0.3, 0.5]), np.array([0.1, 0.1]))
     assert found.amplitudes([1])[0] == pytest.approx(0.8, abs=0.1)

@@ -603,7 +603,8 @@ def _solve(grams, rows, ridges, amplitudes):
 
     grams (L, folds, C, C): products of the residual, row 0, and the sensitivities; rows (1 + k,)
     those that are looked at, 0 first. Normal matrices are scaled to a diagonal of 1 and factorised
-    as L D L' (Golub & Van Loan 2013, section 4.1).
+    as L D L' (Golub & Van Loan 2013, section 4.1) without pivoting: the ridge is a thousand times
+    the rounding of the products, so that no pivot is near zero.
     """
     levels, folds = grams.shape[:2]
     count = len(rows) - 1

@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 
 CHROMIUM = Path("/usr/bin/chromium")
+LONGEST_MS = 180_000
+"""Longest time that a page may take: a busy machine starts the browser's processes slowly, ms."""
 
 
 @contextlib.contextmanager
@@ -31,6 +33,7 @@ def look(browser, path: Path, width: int, scheme: str = "light", picture: Path |
         viewport={"width": width, "height": 900}, color_scheme=scheme, device_scale_factor=1
     )
     page = context.new_page()
+    page.set_default_timeout(LONGEST_MS)
     asked = []
     page.on("request", lambda request: asked.append(request.url))
     page.goto(path.as_uri())

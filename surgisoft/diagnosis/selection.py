@@ -639,12 +639,16 @@ class BestAchievable:
 
 
 def select(problem: Problem, some: list[Candidate], report: Progress) -> Selected:
-    """Rank and propose effects; close ones compete with refined nonlinear parameters."""
+    """Rank and propose effects, the best and those close to it with refined nonlinear parameters.
+
+    Where the model is off by more than it was validated to be, they are refined even if all of them
+    are within chance: to first order and on a grid a large effect may explain little.
+    """
     report("held-out errors")
     selection = ModelSelection.of(problem, some)
     first = selection.scores()
-    close = close_to_best(first, SEARCH.refined_gain)
-    if len(close) > 1:
+    close = close_to_best(first, SEARCH.refined_gain, within_chance=selection.whole_size > 1.0)
+    if close:
         report(f"nonlinear parameters of {' and '.join(score.effect for score in close)}")
         selection = selection.extended(refined(problem, selection.starts(close)))
         first = selection.scores()
@@ -692,12 +696,12 @@ def rmse_interval(problem: Problem, losses: np.ndarray, counts: np.ndarray) -> t
     return float(low), float(high)
 
 
-def close_to_best(first: list[Score], share: float) -> list[Score]:
+def close_to_best(first: list[Score], share: float, within_chance: bool = False) -> list[Score]:
     """The best effect and those that explain at least a share of what it explains.
 
-    Empty where all are within chance.
+    within_chance: whether they count where all effects are within chance; otherwise none does.
     """
-    if not any(_worth_a_look(score) for score in first):
+    if not first or not (within_chance or any(_worth_a_look(score) for score in first)):
         return []
     best = first[0]
     others = [s for s in first[1:] if s.gain >= share * best.gain]

@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+import torch
 
 from surgisoft.diagnosis import selection
 from surgisoft.diagnosis.candidates import candidates
@@ -14,6 +15,7 @@ from surgisoft.diagnosis.selection import ModelSelection
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.checkpoint import default_arm
+from surgisoft.surrogate.effects import make_effect
 from tests.diagnosis.synthetic import backlash, walk
 
 PERIOD_S, SUBSTEPS, NOISE_MM = 0.05, 20, 0.05
@@ -36,6 +38,30 @@ def made(commands: np.ndarray, pressure: np.ndarray) -> Recording:
     blank = np.zeros((len(commands), arm.spec.key_points, 3))
     history = history_of([Recording("made", time_s, measured=pressure, key_points_mm=blank)])
     points = arm.predict(history)[0].numpy()
+    noise = np.random.default_rng(1).normal(0, NOISE_MM, points.shape)
+    return Recording(
+        "made", time_s, measured=commands, key_points_mm=points + noise, noise_mm=NOISE_MM
+    )
+
+
+def supported(rows: int, azimuth_rad: float, rise_rad: float, offset_mm: float) -> Recording:
+    """The default arm beside a plane support that its tip meets: angles of its normal, offset."""
+    arm, time_s = default_arm(), PERIOD_S * np.arange(rows)
+    low, high = np.array(arm.spec.low), np.array(arm.spec.high)
+    commands = low + (0.1 + 0.05 * walk(rows, 3)) * (high - low)
+    blank = np.zeros((rows, arm.spec.key_points, 3))
+    history = history_of([Recording("made", time_s, measured=commands, key_points_mm=blank)])
+    contact = make_effect(
+        "contact",
+        arm.facts,
+        azimuth_rad=azimuth_rad,
+        rise_rad=rise_rad,
+        offset_mm=offset_mm,
+    )
+    beside = arm.replace(effects={**arm.effects, "contact": contact})
+    with torch.no_grad():
+        contact.share.fill_(0.9)
+        points = beside.predict(history)[0].numpy()
     noise = np.random.default_rng(1).normal(0, NOISE_MM, points.shape)
     return Recording(
         "made", time_s, measured=commands, key_points_mm=points + noise, noise_mm=NOISE_MM
@@ -69,6 +95,41 @@ def test_a_lag_before_the_plays_is_no_viscosity_behind_them(lagging, monkeypatch
     fine = {row.effect: row.heldout_rmse_mm for row in found.ranking}
     rough = {row.effect: row.heldout_rmse_mm for row in grid.ranking}
     assert fine["line_lag"] < 0.7 * rough["line_lag"]
+
+
+@pytest.mark.parametrize(
+    ("rows", "azimuth_rad", "rise_rad", "offset_mm", "by_chance"),
+    [
+        (3000, 0.6, 0.4, 44.4, False),  # one effect alone explains most, on the grid too
+        (800, 0.6, 0.2, 32.8, True),  # on the grid it explains little, and is within chance
+    ],
+)
+def test_an_effect_between_points_of_the_grid_is_refined(
+    rows, azimuth_rad, rise_rad, offset_mm, by_chance, monkeypatch
+):
+    """A support whose direction and height lie between those of the grid, with no effect close."""
+    problem = problem_of(default_arm(), [supported(rows, azimuth_rad, rise_rad, offset_mm)])
+    some = candidates(problem, ["contact", "payload", "misalignment"])
+    fine = selection.select(problem, some, lambda text: None)
+    monkeypatch.setattr(selection, "refined", lambda *_: [])
+    rough = selection.select(problem, some, lambda text: None)
+    assert (rough.proposals == ()) == by_chance
+    assert rough.first[0].gain < (0.3 if by_chance else 0.8)
+    assert fine.proposals[0].effects == ("contact",)
+    assert fine.first[0].gain > (0.95 if by_chance else 0.9)
+
+
+def test_a_model_as_good_as_it_was_validated_gets_no_refined_effect(monkeypatch):
+    """Nothing is missing: refined effects would only follow the noise."""
+    low, high = np.array(default_arm().spec.low), np.array(default_arm().spec.high)
+    commands = low + (0.1 + 0.05 * walk(1200, 3)) * (high - low)
+    problem = problem_of(default_arm(), [made(commands, commands)])
+    asked = []
+    monkeypatch.setattr(selection, "refined", lambda *given: asked.append(given) or [])
+    some = candidates(problem, ["contact", "payload", "misalignment"])
+    found = selection.select(problem, some, lambda text: None)
+    assert found.selection.whole_size < 1.0
+    assert not asked
 
 
 def test_what_is_fitted_is_plausible_small_and_new(lagging):

@@ -3,9 +3,10 @@
 `interface` defines a rig, real or virtual; `collect` drives any of them through a protocol
 into a recording. `virtual` is the simulated rig: `arm` (with `rod`, `wall`, `friction`),
 `pneumatics`, `motion_capture` and the hidden `effects`, stepped together in `bench`. It shares no
-code and no formula with the arm models and imports neither them nor torch. `elastica` is a second
-simulated rig, with PyElastica's mechanics. `registry` opens a rig by its name and options, and
-`trial` records on it. `safety` stands between any program and a real rig.
+code with the arm models and imports neither them nor torch; some of its formulas are theirs
+(`docs/results/index.md`). `elastica` is a second simulated rig, with PyElastica's mechanics.
+`registry` opens a rig by its name and options, and `trial` records on it. `safety` stands between
+any program and a real rig.
 """
 
 from surgisoft.rig.collect import collect

@@ -27,6 +27,7 @@ from surgisoft.cli.options import (
     Recordings,
     Refit,
     Report,
+    model_options,
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
@@ -139,32 +140,53 @@ def diagnose(
         written.append(replay)
     elif replay:
         warn(f"{replay} was not written: no rows of the same actuation before and after")
+    corrected = str(apply)
     if apply and found.setup and found.setup.correctable:
-        save_recordings(found.setup.corrected(measured), apply)
+        files = save_recordings(found.setup.corrected(measured), apply)
         written.append(apply)
+        # Files of predictions belong to recordings by their order, which a folder does not keep.
+        corrected = " ".join(map(str, files)) if predictions and len(files) > 1 else corrected
     _show(found)
     show_written(written)
     data = " ".join(map(str, recordings))
+    # Predictions of `--before` come last; no command to run next takes those recordings with them.
+    of_model = model_options((predictions or [])[: len(measured)], model_error)
     if found.setup:
-        _next_after_setup(found.setup, model, data, apply)
+        _next_after_setup(found.setup, model, data, of_model, corrected if apply else None)
     elif apply:
         print(f"nothing to correct: {apply} was not written")
     if found.next_command:
         option = f" --before {' '.join(map(str, before))}" if before else ""
         command = found.next_command.format(model=model, data=data, before=option)
-        print(f"next: {with_effect_files(command)}")
+        _next(command, bool(predictions) or model.suffix in (".csv", ".parquet"), of_model)
 
 
-def _next_after_setup(setup, model: Path, data: str, apply: Path | None) -> None:
+def _next(command: str, predicted: bool, of_model: str) -> None:
+    """Print the command to run next, with the options that say what MODEL is.
+
+    predicted: whether the model is given by predictions, which cannot be amended.
+    """
+    name = command.split()[1]
+    if name == "amend" and predicted:
+        print(
+            "next: give the model as a callable (docs/your_model.md) to amend it: predictions of "
+            "recorded rows cannot be amended"
+        )
+        return
+    print(f"next: {with_effect_files(command if name == 'fit' else command + of_model)}")
+
+
+def _next_after_setup(setup, model: Path, data: str, of_model: str, apply: str | None) -> None:
     """Print what to do about a fault of the set-up."""
     if not setup.correctable:
         if apply:
             print(f"{apply} was not written: this fault cannot be corrected in the recordings")
         print(f"next: {setup.instructions.splitlines()[0]}")
     elif apply:
-        print(f"next: {with_effect_files(f'surgisoft diagnose {model} {apply}')}")
+        print(f"next: {with_effect_files(f'surgisoft diagnose {model} {apply}{of_model}')}")
     else:
-        print(f"next: {with_effect_files(f'surgisoft diagnose {model} {data} --apply CORRECTED')}")
+        again = f"surgisoft diagnose {model} {data} --apply CORRECTED{of_model}"
+        print(f"next: {with_effect_files(again)}")
 
 
 def _show_setup(setup) -> None:

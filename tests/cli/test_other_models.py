@@ -2,16 +2,20 @@
 
 import json
 import sys
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from surgisoft.cli import run
 from surgisoft.diagnosis.other_models import open_model
+from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import load_recording, save_recording
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.callables import named
+from tests.cli.test_printed import diagnosis
 from tests.replay.reading import entities
 from tests.test_your_model import blocks
 
@@ -134,3 +138,79 @@ def test_an_amended_callable_is_a_model_folder(capsys, tmp_path):
     assert run(evaluate) == 2
     assert run([*evaluate, *code]) == 0
     assert run([*f"compare {new} bench.parquet".split(), *code]) == 0
+
+
+PLAN, AMEND = "next-experiment MODEL REC --between creep payload", "amend MODEL --data REC"
+NEXT = [
+    ("lab", "REC --predictions lab.csv --model-error 1.24", PLAN),
+    ("lab", "REC --before REC --predictions lab.csv lab.csv --model-error 1.24", PLAN),
+    ("lab.csv", "REC", PLAN),
+    ("my_arm.py:arm", "REC --model-error 1.24", PLAN),
+    ("my_arm.py:arm", "REC --model-error 1.24", AMEND + " --effect payload"),
+]
+"""Model and options of a diagnosis, and the command that is to be run next."""
+
+
+@pytest.mark.parametrize(("model", "options", "following"), NEXT)
+def test_a_printed_command_opens_the_model_again(model, options, following, capsys, monkeypatch):
+    """The command that `diagnose` prints, as it stands, opens the same model and recordings."""
+    template = following.replace("MODEL", "{model}").replace("REC", "{data}") + " -o NEW.csv"
+    found = diagnosis(next_command=f"surgisoft {template}")
+    monkeypatch.setattr("surgisoft.diagnosis.diagnose.diagnose", lambda *_, **__: found)
+    rec = "bench.parquet"
+    assert run(["diagnose", model, *options.replace("REC", rec).split()]) == 0
+    line = capsys.readouterr().out.splitlines()[-1]
+    made = following.replace("MODEL", model).replace("REC", rec)
+    assert line.startswith(f"next: surgisoft {made}")
+    opened = []
+
+    def keep(*given, predictions=None, error_mm=None, **_):
+        opened.append(open_model(given[0], given[1], None, predictions, error_mm))
+        raise InputError("opened")
+
+    monkeypatch.setattr("surgisoft.diagnosis.design.next_experiment.next_experiment", keep)
+    monkeypatch.setattr("surgisoft.diagnosis.amend.amend", keep)
+    assert run(line.split()[2:]) == 2
+    assert capsys.readouterr().err == "surgisoft: error: opened\n"
+    (one,) = opened
+    assert (one.recordings[0].predicted_mm is not None) == (model in ("lab", "lab.csv"))
+    assert one.model.validation.rmse_mm == (1.24 if "--model-error" in options else None)
+
+
+@pytest.mark.parametrize("model", ["lab.csv", "lab --predictions lab.csv"])
+def test_no_command_amends_predictions(model, capsys, monkeypatch):
+    """`amend` would refuse them; what to do instead is said. A fit takes no options of a model."""
+    name, *rest = model.split()
+    found = diagnosis(next_command="surgisoft amend {model} --effect creep --data {data} -o NEW")
+    monkeypatch.setattr("surgisoft.diagnosis.diagnose.diagnose", lambda *_, **__: found)
+    command = ["diagnose", name, "bench.parquet", *rest, "--model-error", "1.24"]
+    assert run(command) == 0
+    line = capsys.readouterr().out.splitlines()[-1]
+    assert line.startswith("next: give the model as a callable (docs/your_model.md)")
+    assert "surgisoft amend" not in line
+    found.next_command = "surgisoft fit {data} -o NEW"
+    assert run(command) == 0
+    assert capsys.readouterr().out.endswith("next: surgisoft fit bench.parquet -o NEW\n")
+
+
+def test_after_a_correction_predictions_keep_their_order(capsys, monkeypatch, tmp_path):
+    """Files of predictions belong to recordings by order, which is not that of a folder's names."""
+    recording = load_recording("bench.parquet")
+    two = [replace(recording, name=name) for name in ("second", "first")]
+    setup = SimpleNamespace(
+        correctable=True, recordings=["second", "first"], instructions="turn it",
+        alternative_instructions=(), how_to_tell="", corrected=lambda _: two,
+    )  # fmt: skip
+    found = diagnosis(setup=setup)
+    monkeypatch.setattr("surgisoft.diagnosis.diagnose.diagnose", lambda *_, **__: found)
+    new, options = tmp_path / "new", "--predictions lab.csv lab.csv"
+    for one in two:
+        save_recording(one, tmp_path / f"{one.name}.parquet")
+    given = " ".join(str(tmp_path / f"{one.name}.parquet") for one in two)
+    command = f"diagnose lab {given} {options}".split()
+    assert run(command) == 0
+    again = f"surgisoft diagnose lab {given} --apply CORRECTED"
+    assert capsys.readouterr().out.endswith(f"next: {again} {options}\n")
+    assert run([*command, "--apply", str(new)]) == 0
+    files = f"{new / 'second.parquet'} {new / 'first.parquet'}"
+    assert capsys.readouterr().out.endswith(f"next: surgisoft diagnose lab {files} {options}\n")

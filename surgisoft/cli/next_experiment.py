@@ -17,6 +17,7 @@ from surgisoft.cli.options import (
     ModelError,
     Predictions,
     model_options,
+    with_effect_files,
 )
 from surgisoft.cli.options import Rig as RigOption
 from surgisoft.cli.progress import progress
@@ -105,7 +106,9 @@ def next_experiment(
     write_atomically(output, schedule_text(result.protocol))
     if json_file:
         write_json(json_file, result.to_json())
-    later = [*(predictions or []), Path("PREDICTIONS_OF_NEW.csv")] if predictions else None
+    # After a change that removes an effect, only the new recording counts.
+    kept = [] if result.by_hand else predictions or []
+    later = [*kept, Path("PREDICTIONS_OF_NEW.csv")] if predictions else None
     _show(result, model, recordings or [], output, rig, record, model_options(later, model_error))
     if record:
         _record(result, rig, output, record, force)
@@ -141,7 +144,8 @@ def _show(
     # After a change that removes an effect, only the new recording counts.
     old = "" if result.by_hand else "".join(f" {path}" for path in recordings)
     taken = f" --without {' '.join(result.removes)}" if result.by_hand else ""
-    print(f"  then: surgisoft diagnose {model}{old} {new}{taken}{of_model}")
+    following = f"surgisoft diagnose {model}{old} {new}{taken}{of_model}"
+    print(f"  then: {with_effect_files(following)}")
     pairs = sorted(result.pairs, key=lambda pair: pair.after)
     open_ = [pair for pair in pairs if pair.effects not in result.separates]
     shown = max(SHOWN_PAIRS, len(open_))

@@ -566,6 +566,11 @@ def test_an_experiment_that_takes_something_away_is_told_by_hand(
         assert (f" {rec} NEW.parquet" in out) is not by_hand
         assert ("--without payload" in out) is by_hand
         assert "creep or payload: expected chance of the right one 0.50 -> 0.90" in out
+        command = ["next-experiment", "lab", rec, "--predictions", "old.csv", "-o", new]
+        out = printed(capsys, monkeypatch, target, plan, *command)
+        Path(new).unlink()
+        old = "" if by_hand else " old.csv"
+        assert f" --predictions{old} PREDICTIONS_OF_NEW.csv\n" in out
 
 
 def test_no_mounts_are_one_line_with_what_was_repaired(tmp_path, capsys, monkeypatch):

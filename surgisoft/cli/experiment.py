@@ -83,6 +83,7 @@ def run(
         preflight=preflight,
         resume=resume,
         force=force,
+        cluster=cluster,
     )
     with progress(f"experiment {spec.name}") as report:
         about = f"surgisoft experiment run {file.name}"

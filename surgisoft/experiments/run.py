@@ -20,7 +20,7 @@ from torch import Tensor
 
 from surgisoft.agents.evaluate import RATES, episode_table
 from surgisoft.agents.exact_checks import EpisodeCheck, ExactChecks, has_obstacles
-from surgisoft.agents.on_rig import at_benches, real_benches
+from surgisoft.agents.on_rig import at_benches, real_benches, rigs_by_arm
 from surgisoft.agents.rollout import EpisodeRecorders, Instant, Rollout, rollout
 from surgisoft.agents.run_folder import versions
 from surgisoft.config import LARGEST_INTEGER
@@ -37,6 +37,7 @@ from surgisoft.experiments.spec import (
 )
 from surgisoft.files import json_safe, new_folder, read_json, write_json
 from surgisoft.progress import Progress, silent
+from surgisoft.rig.registry import SIMULATED, parse_rig
 from surgisoft.surrogate.code import name_code, named_code
 from surgisoft.tasks.episodes.file import save_episode
 from surgisoft.tasks.episodes.log import EpisodeLog
@@ -88,8 +89,19 @@ def log_file(folder: Path, setting: str, episode: int) -> Path:
     return folder / "logs" / f"{setting}-{episode:04d}.npz"
 
 
-def open_results(spec: Experiment, folder: Path, resume: bool = False, force: bool = False) -> None:
-    """Make the folder of results, or check that it holds results of this experiment."""
+def open_results(
+    spec: Experiment,
+    folder: Path,
+    resume: bool = False,
+    force: bool = False,
+    cluster: str | None = None,
+) -> None:
+    """Make the folder of results, or check that it holds results of this experiment.
+
+    Raises InputError, before anything is written, where a bench that is to be used cannot be
+    opened. cluster: see `run_experiment`; the benches are then those of its workers.
+    """
+    remote = bool(cluster or os.environ.get(CLUSTER))
     there = (folder / FILE).is_file()
     if there and resume and not force:
         if load_experiment(folder / FILE) != spec:
@@ -98,6 +110,8 @@ def open_results(spec: Experiment, folder: Path, resume: bool = False, force: bo
                 "folder, or --force to start again"
             )
         _check_scene(spec, folder)
+        if not remote:
+            check_benches(spec, folder)
         return
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         if not there:
@@ -109,6 +123,8 @@ def open_results(spec: Experiment, folder: Path, resume: bool = False, force: bo
                 f"{folder}: results already exist; --resume continues them, --force replaces them"
             )
     check_playable(spec)
+    if not remote:
+        check_benches(spec)
     about: dict[str, object] = {"versions": versions()}
     if spec.in_scene:
         about["scene_hash"] = scene_of(spec, settings(spec)[0]).content_hash
@@ -146,6 +162,25 @@ def check_playable(spec: Experiment) -> None:
             plain = replace(case, plant="simulation", hidden=(), robot_seed=0, rigs=Case.rigs)
             opened(spec, replace(setting, case=plain))
             seen.add((case.policy, case.arm))
+
+
+def check_benches(spec: Experiment, folder: Path | None = None) -> None:
+    """Raise an InputError unless every bench that may be real opens and fits its arm.
+
+    Each is given back at once: its episodes may begin hours later. folder: results that are
+    continued; a case whose episodes are all there needs no bench any more.
+    """
+    seen = set()
+    for job in jobs(spec):
+        case = job.setting.case
+        if case.plant != "rig" or case.name in seen or (folder and _is_done(folder, job)):
+            continue
+        seen.add(case.name)
+        texts = rigs_by_arm(case.rigs, spec.of.agents).values()
+        if all(parse_rig(text).name in SIMULATED for text in texts):
+            continue
+        for bench in real_benches(build_task(spec, job.setting)).values():
+            bench.close()
 
 
 def run_experiment(

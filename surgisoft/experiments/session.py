@@ -159,13 +159,15 @@ def start_experiment(
     preflight: bool = False,
     resume: bool = False,
     force: bool = False,
+    cluster: str | None = None,
 ) -> tuple[Experiment, Path]:
     """The experiment and its folder of results, new or ready to be resumed.
 
     output: default `results/NAME`. policies: folders of training runs, each added as a case.
     repeats: episodes of each setting. rigs: in place of those of the cases on rigs. preflight:
     whether real ones have to move as their models predict before each setting. resume:
-    continue existing results; force: replace them.
+    continue existing results; force: replace them. cluster: see `finish_experiment`; without one,
+    benches that may be real are opened once and given back before anything is written.
     """
     if resume and force:
         raise InputError("--resume continues results, --force replaces them: give one of the two")
@@ -180,7 +182,7 @@ def start_experiment(
         settings(spec)
     spec = spec if repeats is None else replace(spec, repeats=repeats)
     place = Path(output) if output else Path("results") / spec.name
-    open_results(spec, place, resume, force)
+    open_results(spec, place, resume, force, cluster)
     return spec, place
 
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from surgisoft.agents.run_folder import PACKAGED
+from surgisoft.cli import run
 from surgisoft.config import read_toml
 from surgisoft.errors import InputError
 from surgisoft.experiments.controllers import PhaseControllers, Schedule
@@ -19,12 +20,15 @@ from surgisoft.experiments.session import (
     experiments_of,
     start_experiment,
     with_policy,
+    with_rigs,
 )
 from surgisoft.experiments.spec import Fault, Lesion, load_experiment, save_experiment
+from surgisoft.files import write_json
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.circle_ablation import CircleAblation
 from surgisoft.tasks.laser_supervision import LaserSupervision
 from tests.experiments.tiny import FAULT, TINY, write
+from tests.rig.own_rig import OwnRig
 from tests.tasks.test_episode import made_up
 
 VARY = '[[vary]]\nfield = "{field}"\nvalues = [{values}]\n'
@@ -112,6 +116,35 @@ def test_folders_and_options_that_do_not_fit(tmp_path):
     )
     assert (on_rig.repeats, folder) == (2, out)
     assert [case.rigs for case in on_rig.cases if case.plant == "rig"] == [("virtual:seed=5",)] * 2
+
+
+def test_benches_are_opened_before_anything_is_written(tmp_path, monkeypatch, capsys):
+    """A missing device or another arm is one line before the simulated cases; a bench that opens
+    is given back, and results that are complete need none."""
+    closed: list[str] = []
+    monkeypatch.setattr(OwnRig, "close", lambda rig: closed.append(rig.port))
+    file = write(tmp_path, TINY + '[[cases]]\nname = "simulation"\n' + RIG)
+    own, out = "laser=tests.rig.own_rig:OwnRig:port=a", tmp_path / "out"
+    missing = f"serial:port={tmp_path / 'ttyNOPE'}"
+    for rig, said in (
+        (f"laser={missing}", "cannot be opened"),
+        (f"{own},chambers=4", "arm 'laser' has 3 chambers and 5 key points; the rig's has 4 and 5"),
+    ):
+        assert run(["experiment", "run", str(file), "--rig", rig, "-o", str(out)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert said in line
+        assert not out.exists()
+    assert closed == ["a"]
+    spec, _ = start_experiment(file, out, rigs=[own])
+    assert closed == ["a", "a"]
+    with pytest.raises(InputError, match="cannot be opened"):
+        open_results(with_rigs(spec, [missing]), tmp_path / "other")
+    open_results(with_rigs(spec, [missing]), tmp_path / "other", cluster="tcp://elsewhere:8786")
+    for job in jobs(spec):
+        for episode in range(job.first, job.first + job.count):
+            write_json(row_file(out, job.setting, episode), {})
+    open_results(spec, out, resume=True)
+    assert closed == ["a", "a"]
 
 
 @pytest.fixture(scope="module")

@@ -32,7 +32,7 @@ from surgisoft.errors import InputError
 from surgisoft.rig import Rig
 from surgisoft.rig.interface import is_simulated
 from surgisoft.rig.preflight import preflight
-from surgisoft.rig.registry import HiddenEffect, open_rig, parse_rig
+from surgisoft.rig.registry import HiddenEffect, known_size, open_rig, parse_rig
 from surgisoft.rig.safety import SafeRig
 from surgisoft.scene import frames
 from surgisoft.surrogate.reach import steady_key_points
@@ -217,11 +217,7 @@ class RigArm:
     @staticmethod
     def _check(rig: Rig, arm: ModelArm, dt_s: float) -> None:
         """Raise InputError unless the rig fits the simulated arm and the step of the world."""
-        if (rig.chambers, rig.key_planes) != (arm.chambers, arm.key_points):
-            raise InputError(
-                f"arm '{arm.name}' has {arm.chambers} chambers and {arm.key_points} key points; "
-                f"the rig's has {rig.chambers} and {rig.key_planes}"
-            )
+        _check_size((rig.chambers, rig.key_planes), arm)
         require_kPa(arm, "a rig")
         if rig.unit != "kPa":
             raise InputError(f"arm '{arm.name}' is commanded in kPa, the rig in {rig.unit}")
@@ -362,6 +358,15 @@ class RigArm:
         return self.simulated.posed(part, body)
 
 
+def _check_size(size: tuple[int, int], arm: ModelArm) -> None:
+    """Raise InputError unless a rig of so many chambers and key points fits the simulated arm."""
+    if size != (arm.chambers, arm.key_points):
+        raise InputError(
+            f"arm '{arm.name}' has {arm.chambers} chambers and {arm.key_points} key points; "
+            f"the rig's has {size[0]} and {size[1]}"
+        )
+
+
 def on_rig(
     task: Task,
     config: RigConfig | None = None,
@@ -378,6 +383,10 @@ def on_rig(
     world, moved = copy.copy(task.world), copy.copy(task)
     dt_s = world.config.dt_s
     texts = rigs_by_arm(config.rigs, tuple(world.arms))
+    for name, arm in world.arms.items():
+        size = known_size(texts[name], {"seed": config.seed}) if build is named_rig else None
+        if size is not None and isinstance(arm, ModelArm):
+            _check_size(size, arm)
     arms: dict[str, RigArm] = {}
     with ExitStack() as opened:
         for name, arm in world.arms.items():

@@ -305,6 +305,17 @@ def check_rig(text: str) -> None:
     _asked(text)
 
 
+def known_size(text: str, defaults: Mapping[str, Any] | None = None) -> tuple[int, int] | None:
+    """Numbers of chambers and key points of the rig of a text where they are known before it opens.
+
+    Of the rig `elastica`, whose first opening compiles for many seconds. None: not known. defaults:
+    see `open_rig`. Raises InputError as `check_rig` does.
+    """
+    asked = _asked(text)
+    seed = asked.values.get("seed", (defaults or {}).get("seed", 0))
+    return _elastica().robot_size(seed) if asked.name == "elastica" and seed >= 0 else None
+
+
 def open_rig(text: str, defaults: Mapping[str, Any] | None = None, **fields: Any) -> Rig:
     """Open the rig that `NAME[:option=value,...]` or `package.module:object[:...]` names.
 

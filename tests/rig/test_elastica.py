@@ -10,6 +10,7 @@ from scipy.optimize import brentq
 
 pytest.importorskip("elastica", reason="PyElastica is not installed (extra `elastica`)")
 
+from surgisoft.agents.on_rig import RigConfig, on_rig
 from surgisoft.cli import run
 from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import Protocol
@@ -29,6 +30,8 @@ from surgisoft.rig.elastica.rod import (
 )
 from surgisoft.rig.elastica.wall import Wall, new_memory, strain_wall
 from surgisoft.rig.interface import Rig, SimulatedRig
+from surgisoft.rig.registry import known_size
+from surgisoft.tasks.track import track_circle
 
 PLAIN = Wall(np.zeros(2), np.ones(2), np.zeros(3), 0.0, 0.0, 0.0)
 """A linear wall."""
@@ -438,3 +441,22 @@ def test_it_imports_nothing_of_models_or_diagnosis():
             for name in names:
                 for side in ("surrogate", "diagnosis", "virtual", "torch"):
                     assert side not in name.split("."), f"{path.name} imports {name}"
+
+
+def test_the_size_of_a_robot_is_known_before_it_is_made():
+    """Also by the text of its rig, whose seed is the default where the text gives none."""
+    for seed in range(30):
+        plant, _ = make_robot(seed, 12, None, 1.0)
+        assert package.robot_size(seed) == (len(plant.areas), len(plant.nodes))
+    assert known_size("elastica:seed=101") == known_size("elastica", {"seed": 101}) == (3, 3)
+    assert known_size("elastica") == package.robot_size(0)
+    assert known_size("virtual") is None
+
+
+def test_a_robot_of_another_size_is_refused_before_it_is_made(monkeypatch):
+    def made(*_, **__):
+        raise AssertionError("the robot was made")
+
+    monkeypatch.setattr(package, "ElasticaRig", made)
+    with pytest.raises(InputError, match=r"3 chambers and 5 key points; the rig's has 3 and 3"):
+        on_rig(track_circle(), RigConfig(rigs=("elastica:seed=101",)))

@@ -7,5 +7,6 @@ all as a `Rig`.
 
 from surgisoft.rig.elastica.hidden import HIDDEN
 from surgisoft.rig.elastica.rig import ElasticaRig, ElasticaRigConfig
+from surgisoft.rig.elastica.robot import robot_size
 
-__all__ = ["HIDDEN", "ElasticaRig", "ElasticaRigConfig"]
+__all__ = ["HIDDEN", "ElasticaRig", "ElasticaRigConfig", "robot_size"]

@@ -6,6 +6,7 @@ continuum arms where a line states none other (Rus & Tolley 2015; Polygerinos et
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,6 +23,46 @@ PERIODS_S = (0.05, 0.08, 0.1)
 """Times between samples that a robot's cameras may have [s]: 20, 12.5 and 10 Hz."""
 
 
+class Outline(NamedTuple):
+    """What is drawn of a robot first; everything else follows from it or is drawn after it."""
+
+    length: float
+    """Length at rest [m]."""
+    radius: float
+    """Outer radius [m]."""
+    density: float
+    """Density of the silicone with its chambers [kg/m^3]."""
+    modulus: float
+    """Young's modulus [Pa]."""
+    chambers: int
+    """Number m of chambers."""
+    planes: int
+    """Number n of key planes."""
+
+
+def _outline(rng: np.random.Generator) -> Outline:
+    """The outline of the robot whose draws begin."""
+    length = rng.uniform(0.06, 0.15)
+    radius = length / rng.uniform(7.0, 10.5)
+    density = rng.uniform(850.0, 1150.0)  # silicone with empty chambers, up to filled silicone
+    modulus = math.exp(rng.uniform(math.log(6e4), math.log(1.4e5)))
+    # Weight over bending stiffness: beyond about 8 an upright column buckles (Greenhill 1881).
+    slack = 4.0 * density * STANDARD_GRAVITY * length**3 / radius**2
+    modulus = max(modulus, slack / 3.5)
+    chambers = int(rng.choice([2, 3, 3, 3, 4]))
+    return Outline(length, radius, density, modulus, chambers, int(rng.integers(3, 7)))
+
+
+def robot_size(seed: int) -> tuple[int, int]:
+    """Numbers of chambers and key planes of the robot of a seed, which is not made."""
+    outline = _outline(_draws(seed))
+    return outline.chambers, outline.planes
+
+
+def _draws(seed: int) -> np.random.Generator:
+    return np.random.default_rng([seed, 0xE1A])
+
+
 def make_robot(
     seed: int, elements: int, gravity: np.ndarray | None, noise: float
 ) -> tuple[Plant, Body]:
@@ -30,16 +71,8 @@ def make_robot(
     elements: of the rod; gravity: (3,) unit vector of weight, arm base frame (None: drawn,
     hanging); noise: factor on the cameras' noise.
     """
-    rng = np.random.default_rng([seed, 0xE1A])
-    length = rng.uniform(0.06, 0.15)
-    radius = length / rng.uniform(7.0, 10.5)
-    density = rng.uniform(850.0, 1150.0)  # silicone with empty chambers, up to filled silicone
-    modulus = math.exp(rng.uniform(math.log(6e4), math.log(1.4e5)))
-    # Weight over bending stiffness: beyond about 8 an upright column buckles (Greenhill 1881).
-    slack = 4.0 * density * STANDARD_GRAVITY * length**3 / radius**2
-    modulus = max(modulus, slack / 3.5)
-    m = int(rng.choice([2, 3, 3, 3, 4]))
-    planes = int(rng.integers(3, 7))
+    rng = _draws(seed)
+    length, radius, density, modulus, m, planes = _outline(rng)
     body = straight_body(elements, length, radius, density, modulus)
     uneven = np.exp(_smooth(rng, elements, 0.04))
     body.shear_matrix[:] *= uneven

@@ -1,9 +1,12 @@
 """Data-quality warnings of a diagnosis: what the recordings cannot support."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.spatial import cKDTree
 
 from surgisoft.diagnosis.residuals import Problem
+from surgisoft.measurement.recordings import AlarmInfo, Recording, after_alarm
 
 FAR_FROM_FIT = 2.0
 """An actuation is far from the fit where its distance from the nearest actuation of the fit exceeds
@@ -46,6 +49,40 @@ def thinning_notes(problem: Problem) -> tuple[str, ...]:
     return (
         f"{rows:,} rows are thinned: effects are fitted to {len(problem.index):,} of them, evenly "
         "spaced; the model and the memories of effects follow every row",
+    )
+
+
+def alarm_hints(recordings: Sequence[Recording], training: Sequence[Recording]) -> tuple[str, ...]:
+    """A sentence for each recording of a run in which an alarm was raised (`surgisoft run`).
+
+    It names the moment and the recording that begins there, and says where the diagnosis looked at
+    no sample after it. recordings: as they were given; training: those with the key points of
+    held-out rows missing (`Sealed`), in the same order.
+    """
+    return tuple(
+        _alarm_hint(recording, recording.alarm, bool(_seen_since(part, recording.alarm.since_s)))
+        for recording, part in zip(recordings, training, strict=True)
+        if recording.alarm is not None
+    )
+
+
+def _seen_since(recording: Recording, since_s: float) -> int:
+    """Number of samples with key points from a time on [s]."""
+    seen = np.isfinite(recording.key_points_mm).any(axis=(1, 2))
+    return int((seen & (recording.t_s >= since_s)).sum())
+
+
+def _alarm_hint(recording: Recording, alarm: AlarmInfo, seen: bool) -> str:
+    looked = "this diagnosis looked at samples of before and after it together"
+    if not seen:
+        looked = "this diagnosis looked at no sample after it, because the last quarter is held out"
+    after = after_alarm(recording.source) if recording.source is not None else None
+    advice = f"diagnose the samples from {alarm.since_s:.1f} s on alone"
+    if after is not None and after.is_file():
+        advice = f"diagnose {after}, which begins there"
+    return (
+        f"{recording.name}: an alarm was raised at {alarm.raised_s:.1f} s of the run: the model "
+        f"has not been valid since {alarm.since_s:.1f} s; {looked}; {advice}"
     )
 
 

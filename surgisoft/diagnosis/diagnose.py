@@ -24,7 +24,7 @@ from pathlib import Path
 
 from surgisoft.diagnosis.candidates import candidates
 from surgisoft.diagnosis.criteria import SEARCH
-from surgisoft.diagnosis.data_quality import data_quality_warnings, thinning_notes
+from surgisoft.diagnosis.data_quality import alarm_hints, data_quality_warnings, thinning_notes
 from surgisoft.diagnosis.decision import (
     Decision,
     Kind,
@@ -186,7 +186,7 @@ class Diagnosis:
     next_experiment: Experiment | None = None
     """The experiment that would tell competing effects apart; None where nothing is open."""
     checks: tuple[str, ...] = ()
-    """Data-quality warnings."""
+    """Data-quality warnings, and the alarms of recorded runs."""
     notes: tuple[str, ...] = ()
     """Recordings under another direction of gravity, or beyond the range of the model's fit."""
     axis: str | None = None
@@ -328,7 +328,8 @@ def diagnose(
     if result.next_command.startswith("surgisoft amend"):
         unknown = not held_out_in_fit(model, whole, table.held_out)
         result = replace(result, next_command=amend_command(result, unknown))
-    return replace(result, notes=notes, seconds=time.perf_counter() - begin)
+    checks = (*alarm_hints(whole, recordings), *result.checks)
+    return replace(result, checks=checks, notes=notes, seconds=time.perf_counter() - begin)
 
 
 def reason_of_result(verdict: Verdict) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from surgisoft.measurement.recordings import Recording, check_writable, save_recording
+from surgisoft.measurement.recordings import AlarmInfo, Recording, check_writable, save_recording
 from surgisoft.measurement.recordings.log import LogHeader, RecordingLog, recording_log
 from surgisoft.rig.interface import Rig, Sample
 
@@ -64,8 +64,8 @@ class RunLog:
                 sample.temp_C,
             )
 
-    def recording(self, name: str) -> Recording:
-        """The samples so far as a recording."""
+    def recording(self, name: str, alarm: AlarmInfo | None = None) -> Recording:
+        """The samples so far as a recording; alarm: the first one of the run."""
         rig, count = self.rig, min(len(self.samples), len(self.runs))
         samples = self.samples[:count]
         room = [sample.temp_C for sample in samples]
@@ -84,12 +84,13 @@ class RunLog:
             gravity=rig.gravity,
             kind="continuous",
             note=self.note,
+            alarm=alarm,
         )
 
-    def finish(self, name: str) -> Recording | None:
-        """The recording, written in its final form; None without a sample."""
+    def finish(self, name: str, alarm: AlarmInfo | None = None) -> Recording | None:
+        """The recording, written in its final form; None without a sample. See `recording`."""
         self.close()
-        found = self.recording(name) if self.samples else None
+        found = self.recording(name, alarm) if self.samples else None
         if found is not None and self.path is not None:
             save_recording(found, self.path, self.force)
         self.discard()

@@ -42,7 +42,13 @@ from surgisoft.live.log import RunLog
 from surgisoft.live.watch import Companion, Finished, Instant, WatchedRig, WatchedSimulation
 from surgisoft.measurement.histories import actuation_of, check_fits, history_of
 from surgisoft.measurement.protocols import PROTOCOLS, Protocol, make_protocol
-from surgisoft.measurement.recordings import Recording, load_recordings, save_recording
+from surgisoft.measurement.recordings import (
+    AlarmInfo,
+    Recording,
+    after_alarm,
+    load_recordings,
+    save_recording,
+)
 from surgisoft.progress import Progress, silent
 from surgisoft.rig.collect import check_fits as check_protocol
 from surgisoft.rig.collect import runs_of
@@ -793,17 +799,18 @@ class _Session:
 
     def _result(self, log: RunLog, clock: Clock) -> RunResult:
         """Write the recording and what belongs to it."""
-        recording = log.finish(self._name) if log.samples else None
+        charts = self.charts
+        alarms = tuple(charts.alarms) if charts is not None else ()
+        first = AlarmInfo(alarms[0].at_s, alarms[0].since_s) if alarms else None
+        recording = log.finish(self._name, first) if log.samples else None
         if recording is None:
             log.discard()
             raise InputError("the run ended before its first sample; nothing was recorded")
-        charts = self.charts
-        alarms = tuple(charts.alarms) if charts is not None else ()
         written: list[Path] = []
         if log.path is not None:
             written.append(log.path)
             if alarms:
-                after = log.path.with_name(f"{log.path.stem}-after{log.path.suffix}")
+                after = after_alarm(log.path)
                 part = since(recording, alarms[0].since_s, after.stem)
                 save_recording(part, after, self.request.force)
                 written.append(after)
@@ -845,6 +852,7 @@ def since(recording: Recording, begin_s: float, name: str) -> Recording:
         run=recording.run[rows],
         temp_C=of(recording.temp_C),
         payload_g=of(recording.payload_g),
+        alarm=None,
         note=f"{recording.note}, from {begin_s:.1f} s on",
     )
 

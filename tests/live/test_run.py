@@ -5,6 +5,7 @@ import os
 import signal
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ import torch
 
 import surgisoft
 from surgisoft.cli import run as command
+from surgisoft.diagnosis.data_quality import alarm_hints
+from surgisoft.diagnosis.residuals import Sealed
 from surgisoft.errors import InputError
 from surgisoft.live.session import LEAD_IN_S, elsewhere, run
 from surgisoft.measurement.histories import history_of
@@ -123,6 +126,33 @@ def test_what_came_after_the_change_is_a_recording_of_its_own(changed):
     assert after.t_s[0] == pytest.approx(max(0.0, begin_s - LEAD_IN_S), abs=0.06)
     rows = found.recording.t_s >= begin_s
     np.testing.assert_array_equal(after.key_points_mm[seen], found.recording.key_points_mm[rows])
+
+
+def test_a_diagnosis_of_the_whole_run_names_its_alarm(changed, tmp_path):
+    """The recording keeps the alarm, what came after it has none, and no alarm gives no hint."""
+    found, _ = changed
+    whole, after = (load_recording(path, on_warning=lambda _: None) for path in found.written)
+    assert whole.alarm == found.recording.alarm
+    assert (whole.alarm.raised_s, whole.alarm.since_s) == (
+        found.alarms[0].at_s,
+        found.alarms[0].since_s,
+    )
+    assert after.alarm is None
+    result = surgisoft.diagnose("default", whole, setup_tests=False, refit="never")
+    first, *rest = result.checks
+    assert f"run: an alarm was raised at {whole.alarm.raised_s:.1f} s of the run" in first
+    assert f"not been valid since {whole.alarm.since_s:.1f} s; this diagnosis looked at" in first
+    assert first.endswith(f"diagnose {found.written[1]}, which begins there")
+    assert not [text for text in rest if "alarm" in text]
+    late = replace(whole, alarm=replace(whole.alarm, since_s=60.0))
+    parts = Sealed([late, after]).training
+    (hint,) = alarm_hints([late, after], parts)
+    assert "at no sample after it, because the last quarter is held out; diagnose /" in hint
+    assert "samples of before and after it together" in alarm_hints([late], [late])[0]
+    moved = replace(late, source=tmp_path / "run.parquet")
+    (hint,) = alarm_hints([moved], [moved])
+    assert hint.endswith("; diagnose the samples from 60.0 s on alone")
+    assert alarm_hints([after], [after]) == ()
 
 
 def test_the_view_holds_every_sample(changed, tmp_path):

@@ -11,6 +11,7 @@ from hypothesis.extra import numpy as npst
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import (
+    AlarmInfo,
     ArmInfo,
     Recording,
     check_rows,
@@ -296,3 +297,22 @@ def test_summary_describes_the_recording():
     assert "continuous, 6 rows, 2 runs, 2 channels in kPa, 2 key points" in lines
     assert "0.2 s in all, one row each 0.05 s" in lines
     assert "missing in 3 rows (50.0%)" in lines
+
+
+@pytest.mark.parametrize("name", ["run.csv", "run.parquet"])
+def test_the_alarm_of_a_run_stays_with_its_recording(tmp_path, name):
+    """In the sidecar, whose files without one open as before."""
+    path = tmp_path / name
+    plain = Recording("run", np.arange(3.0), np.zeros((3, 1)), np.ones((3, 1, 3)))
+    save_recording(plain, path)
+    assert "alarm" not in path.with_suffix(".toml").read_text()
+    assert load_recording(path).alarm is None
+    save_recording(dataclasses.replace(plain, alarm=AlarmInfo(2.5, 1.25)), path, force=True)
+    assert "[alarm]\nraised_s = 2.5\nsince_s = 1.25\n" in path.with_suffix(".toml").read_text()
+    assert load_recording(path).alarm == AlarmInfo(2.5, 1.25)
+    path.with_suffix(".toml").write_text("[alarm]\nraised_s = 2.5\n")
+    with pytest.raises(InputError, match="since_s"):
+        load_recording(path)
+    path.with_suffix(".toml").write_text("[alarm]\nraised_s = nan\nsince_s = 1.0\n")
+    with pytest.raises(InputError, match="nan"):
+        load_recording(path)

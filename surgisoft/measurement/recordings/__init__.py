@@ -4,6 +4,7 @@ The file format is described in docs/recordings.md.
 """
 
 from surgisoft.measurement.recordings.file import (
+    after_alarm,
     check_writable,
     load_recording,
     load_recordings,
@@ -14,6 +15,7 @@ from surgisoft.measurement.recordings.predictions import with_predictions
 from surgisoft.measurement.recordings.quality import QualityWarning, find_warnings, summary
 from surgisoft.measurement.recordings.recording import (
     KINDS,
+    AlarmInfo,
     ArmInfo,
     Recording,
     check_rows,
@@ -22,9 +24,11 @@ from surgisoft.measurement.recordings.recording import (
 
 __all__ = [
     "KINDS",
+    "AlarmInfo",
     "ArmInfo",
     "QualityWarning",
     "Recording",
+    "after_alarm",
     "check_rows",
     "check_same_arm",
     "check_writable",

@@ -267,6 +267,12 @@ def _check_order(table: Table, t_s: np.ndarray, run: np.ndarray, rows: np.ndarra
         )
 
 
+def after_alarm(path: str | Path) -> Path:
+    """The file beside a recording that holds what came after its alarm (`surgisoft run`)."""
+    path = Path(path)
+    return path.with_name(f"{path.stem}-after{path.suffix}")
+
+
 def check_writable(path: str | Path, force: bool = False) -> None:
     """Raise where `save_recording` would refuse this path."""
     path = Path(path)

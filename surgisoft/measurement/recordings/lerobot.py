@@ -12,7 +12,7 @@ Source: the format as LeRobot 0.4.4 writes and reads it (`codebase_version` "v3.
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -129,7 +129,8 @@ def save_lerobot(
         notes.append(f"{lost} of {total} frames lack a key point (NaN); a policy cannot take them")
     with new_folder(folder) as draft:
         _write(draft, episodes, names, rate, task)
-        (draft / SIDECAR).write_text(sidecar_text(first), encoding="utf-8")
+        # An alarm is that of one recording, and the sidecar counts for all.
+        (draft / SIDECAR).write_text(sidecar_text(replace(first, alarm=None)), encoding="utf-8")
     return notes
 
 

@@ -35,6 +35,16 @@ class ArmInfo:
     """Outer diameter of the arm [mm]."""
 
 
+@dataclass(frozen=True)
+class AlarmInfo:
+    """The first alarm of the run that was recorded (`surgisoft run`): the model no longer held."""
+
+    raised_s: float
+    """Time of the recording at which it was raised [s]."""
+    since_s: float
+    """Estimated time of the change [s]."""
+
+
 @dataclass(frozen=True, eq=False)
 class Recording:
     """One table of measurements: T samples of m actuation channels and n key points."""
@@ -67,6 +77,8 @@ class Recording:
     """Standard deviation of a key point's coordinate as the lab knows it [mm]."""
     note: str = ""
     """Free text, for people."""
+    alarm: AlarmInfo | None = None
+    """The alarm of the run that was recorded; None where none was raised."""
     source: Path | None = None
     """The file that it was read from."""
     predicted_mm: np.ndarray | None = None
@@ -209,6 +221,9 @@ def _check_sidecar_values(recording: Recording) -> None:
     for name, value in sizes.items():
         if value is not None and not (np.isfinite(value) and value > 0):
             _fail(recording, f"{name} is {value}, expected a positive number")
+    alarm = recording.alarm
+    if alarm is not None and not np.isfinite([alarm.raised_s, alarm.since_s]).all():
+        _fail(recording, f"alarm at {alarm.raised_s} s since {alarm.since_s} s, expected times")
     noise = recording.noise_mm
     if noise is not None and not (np.isfinite(noise) and noise >= 0):
         _fail(recording, f"noise_mm is {noise}, expected a number >= 0")

@@ -1,6 +1,6 @@
 """The sidecar NAME.toml of a recording: the arm, gravity and how the recording was made."""
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,6 +12,7 @@ from surgisoft.measurement.recordings.recording import (
     KINDS,
     NOT_NEGATIVE,
     UNIT_TOLERANCE,
+    AlarmInfo,
     ArmInfo,
     Recording,
 )
@@ -53,6 +54,8 @@ class Sidecar:
     """Table [gravity]."""
     recording: RecordingTable = field(default_factory=RecordingTable)
     """Table [recording]."""
+    alarm: AlarmInfo | None = None
+    """Table [alarm], where the recorded run raised one."""
 
     @property
     def fields(self) -> dict[str, Any]:
@@ -62,6 +65,7 @@ class Sidecar:
             "kind": self.recording.kind,
             "noise_mm": self.recording.noise_mm,
             "note": self.recording.note,
+            "alarm": self.alarm,
         }
         return {"arm": self.arm} | {k: v for k, v in stated.items() if v is not None}
 
@@ -84,4 +88,6 @@ def sidecar_text(recording: Recording) -> str:
     if recording.gravity is not None:
         content["gravity"] = {"direction": recording.gravity.tolist()}
     content["recording"] = {k: v for k, v in about.items() if v is not None and v != ""}
+    if recording.alarm is not None:
+        content["alarm"] = {k: float(v) for k, v in asdict(recording.alarm).items()}
     return tomli_w.dumps({section: fields for section, fields in content.items() if fields})

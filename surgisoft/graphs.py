@@ -17,6 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from surgisoft.errors import InputError
+
 OPSET = 20
 """ONNX operator set of the files: onnxruntime 1.17 (2024) and later read it."""
 
@@ -147,7 +149,15 @@ def _tuple(value) -> tuple[Tensor, ...]:
 
 
 def _line(error: Exception) -> str:
-    """The first line of a message that says something, shortened."""
+    """The first line of a message that says something, shortened.
+
+    The message of an InputError, which tells what to do, is whole and without its class.
+    """
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, InputError):
+            return str(cause)
+        cause = cause.__cause__ or cause.__context__
     cause = error.__cause__ or error
     lines = [line.strip() for line in str(cause).splitlines() if line.strip()]
     return f"{type(cause).__name__}: {lines[0][:140]}" if lines else type(cause).__name__

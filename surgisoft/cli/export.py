@@ -51,6 +51,10 @@ def export(
     and policy.json states every name, order, unit and range. A model gives start(pressure) and
     step(state, pressure, dt) -> state, key points, and arm.json.
     """
+    from surgisoft.surrogate.callables.named import is_callable_name, no_graph
+
+    if is_callable_name(str(source)):
+        raise no_graph(str(source))
     is_model = str(source) == "default" or (source / "weights.safetensors").is_file()
     if is_model and (which is not None or check):
         raise InputError(f"{source}: is an arm model; --which and --check are for training runs")

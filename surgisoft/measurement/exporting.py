@@ -5,6 +5,7 @@ from pathlib import Path
 from surgisoft.measurement.fitting import Recordings
 from surgisoft.measurement.histories import check_fits, history_of
 from surgisoft.measurement.recordings import load_recordings
+from surgisoft.surrogate.callables.named import is_callable_name, no_graph
 from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.export import export_arm as export_histories
 from surgisoft.surrogate.model import ArmModel
@@ -23,6 +24,8 @@ def export_arm(
     model: a model or its folder. recordings: over whose rows files and model are compared too
     (`surgisoft.surrogate.export.differences`).
     """
+    if isinstance(model, str | Path) and is_callable_name(str(model)):
+        raise no_graph(str(model))
     none = isinstance(recordings, list | tuple) and not recordings
     arm, measured = load_model(model), [] if none else load_recordings(recordings)
     check_fits(arm.spec, measured)

@@ -62,6 +62,15 @@ def is_callable_name(text: str) -> bool:
     return text in offered()
 
 
+def no_graph(name: str) -> InputError:
+    """The InputError for an export of the callable of a name."""
+    return InputError(
+        f"{name} is a Python callable, which cannot be written as a graph (ONNX, TorchScript): "
+        "expected a model that 'surgisoft fit' made; fit one to recordings of the arm "
+        "('surgisoft fit REC -o MODEL') and export that, or call the callable itself from Python"
+    )
+
+
 def named_callable(name: str) -> Named:
     """Import the callable of a name, which runs its code, and remember it as named by the user.
 

@@ -16,7 +16,13 @@ import torch
 from torch import Tensor, nn
 
 from surgisoft.errors import InputError
-from surgisoft.surrogate.callables.named import Named, checked_points, raised_by, stored_callable
+from surgisoft.surrogate.callables.named import (
+    Named,
+    checked_points,
+    no_graph,
+    raised_by,
+    stored_callable,
+)
 from surgisoft.surrogate.history import History
 
 DIFFERENCE = 5e-3
@@ -167,10 +173,7 @@ class CallableNetwork(nn.Module):
 
     def no_graph(self) -> InputError:
         """The InputError for an export: what the callable computes is not in PyTorch's graph."""
-        return InputError(
-            f"{self.name} is a Python callable, which cannot be written as a graph: expected a "
-            "model that 'surgisoft fit' made; use the callable itself where you need its graph"
-        )
+        return no_graph(self.name)
 
     # The callable -------------------------------------------------------------------------
 

@@ -95,8 +95,9 @@ EffectFiles = Annotated[
         metavar="FILE.py|PACKAGE.MODULE:OBJECT...",
         callback=_register,
         help="Files of user-defined effects (docs/effects.md): those in the model, and further "
-        "candidates. Also the callable that the model was made from (docs/your_model.md). All of "
-        "them are executed, so name only files that you trust.",
+        "candidates. As --model-code (another name of this option): the callable that the model "
+        "was made from (docs/your_model.md). All of them are executed, so name only files that you "
+        "trust.",
     ),
 ]
 """Option of every command that opens a model. Reading the command line runs the code."""

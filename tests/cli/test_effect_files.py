@@ -131,6 +131,17 @@ def test_every_command_that_opens_a_model_has_the_option():
     assert having == set(COMMANDS) | {"fit"}
 
 
+@pytest.mark.parametrize("name", ["compare", "experiment run", "fit", "scene check", "train"])
+def test_the_help_names_both_names_of_the_option(name, capsys, monkeypatch):
+    """Also where the column of the names has no room for the second one: 80 columns."""
+    monkeypatch.setenv("COLUMNS", "80")
+    assert run([*name.split(), "--help"]) == 0
+    shown = capsys.readouterr().out
+    assert max(map(len, shown.splitlines())) <= 80
+    assert "--effect-file" in shown
+    assert "--model-code " in shown
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_command_opens_the_model_only_with_its_file(name, capsys):
     arguments = COMMANDS[name].split()

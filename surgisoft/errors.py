@@ -36,6 +36,13 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> InputError:
     return InputError(f"unknown {kind} '{name}': known are {', '.join(sorted(known))}")
 
 
+def exists_already(path: object) -> InputError:
+    """InputError for an output that is there, for readers at the command line and in Python."""
+    return InputError(
+        f"{path}: exists already; choose another name or use --force (in Python force=True)"
+    )
+
+
 def counted(number: int, thing: str) -> str:
     """Number and noun of a message: `1 episode`, `2,000 episodes`."""
     return f"{number:,} {thing}" if number == 1 else f"{number:,} {thing}s"

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from surgisoft.errors import InputError, unknown_name
+from surgisoft.errors import InputError, exists_already, unknown_name
 from surgisoft.files import new_folder
 from surgisoft.progress import Progress, silent
 from surgisoft.scene import frames
@@ -570,7 +570,7 @@ def check_target(folder: Path, force: bool) -> None:
     if not folder.exists():
         return
     if not force:
-        raise InputError(f"{folder}: exists already; choose another name or use --force")
+        raise exists_already(folder)
     if not folder.is_dir() or (not (folder / FILE).exists() and any(folder.iterdir())):
         raise InputError(f"{folder}: is not a scene; --force replaces only a scene's folder")
     if not os.access(folder, os.W_OK | os.X_OK):

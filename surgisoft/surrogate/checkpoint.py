@@ -118,7 +118,9 @@ def claim_folder(folder: str | Path, force: bool = False) -> Path:
     if not above.is_dir() or not os.access(above, os.W_OK):
         raise InputError(f"{folder}: cannot be written, {above} is not a writable folder")
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not force):
-        raise InputError(f"{folder}: already exists; choose another name or pass --force")
+        raise InputError(
+            f"{folder}: already exists; choose another name or pass --force (in Python force=True)"
+        )
     if folder.is_dir() and any(folder.iterdir()) and not (folder / "config.json").is_file():
         raise InputError(f"{folder}: holds files that are not a model; choose another name")
     return folder

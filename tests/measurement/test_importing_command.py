@@ -89,7 +89,8 @@ def test_existing_recordings_are_kept_all_of_them(lab, capsys):
     assert surgisoft(*arguments) == 2
     error = capsys.readouterr().err
     assert error == (
-        f"surgisoft: error: {out}/two.parquet: exists already; choose another name or use --force\n"
+        f"surgisoft: error: {out}/two.parquet: exists already; choose another name or use --force "
+        "(in Python force=True)\n"
     )
     assert [p.name for p in out.iterdir()] == ["two.parquet"]
     assert (out / "two.parquet").read_text() == "mine"

@@ -106,7 +106,7 @@ def test_paths_that_cannot_hold_a_recording(tmp_path):
     for call, message in (
         (lambda: check_writable(tmp_path / "a.txt"), "suffix '.txt', expected .csv or .parquet"),
         (lambda: check_writable(tmp_path / "b.csv"), "is a folder, expected the name of a file"),
-        (lambda: check_writable(tmp_path / "full/a.csv"), "exists already; choose another name"),
+        (lambda: check_writable(tmp_path / "full/a.csv"), "use --force (in Python force=True)"),
         (lambda: open_table(tmp_path / "pipe.csv"), "not a regular file, expected a recording"),
         (lambda: save_recordings(twice, tmp_path / "new"), "two recordings are called 'rec'"),
         (lambda: save_recordings(twice[:1], tmp_path / "full"), "exists already, expected a new"),

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet as pq
 
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, exists_already
 from surgisoft.files import new_file, new_folder
 from surgisoft.measurement.recordings.columns import Layout, parse_header
 from surgisoft.measurement.recordings.log import SUFFIX as LOG_SUFFIX
@@ -282,7 +282,7 @@ def check_writable(path: str | Path, force: bool = False) -> None:
         if target.is_dir():
             raise InputError(f"{target}: is a folder, expected the name of a file")
         if target.exists() and not force:
-            raise InputError(f"{target}: exists already; choose another name or use --force")
+            raise exists_already(target)
 
 
 def save_recording(recording: Recording, path: str | Path, force: bool = False) -> None:

@@ -157,7 +157,7 @@ def recording_log(
     if path.exists() and not force:
         raise InputError(
             f"{path}: the log of an interrupted recording is there; use it ('surgisoft recording "
-            f"{path}' reads it), remove it, or use --force"
+            f"{path}' reads it), remove it, or use --force (in Python force=True)"
         )
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", encoding="utf-8") as file:

@@ -1,5 +1,7 @@
 """Episodes of the scripted expert, for the tests of tasks."""
 
+from dataclasses import replace
+
 import torch
 
 from surgisoft.tasks.base import Episodes, Outcome, Task, TaskState
@@ -22,3 +24,12 @@ def scripted_states(
             outcomes.append(outcome)
             over |= outcome.done
     return states, outcomes
+
+
+def with_gap(state: TaskState, episode: int) -> TaskState:
+    """The state with the first station of an episode's path uncut, whatever was cut of it."""
+    scene = state.world.scene
+    peak = scene.dose.peak.clone()
+    peak[episode, 0] = 0.0
+    dose = replace(scene.dose, peak=peak)
+    return replace(state, world=replace(state.world, scene=replace(scene, dose=dose)))

@@ -9,7 +9,7 @@ from surgisoft.errors import InputError
 from surgisoft.scene.spec import PHANTOM
 from surgisoft.tasks.registry import make_task
 from surgisoft.tasks.two_laser_ring import LASERS, TwoLaserRing, TwoLaserRingConfig
-from tests.tasks.scripted import scripted_states
+from tests.tasks.scripted import scripted_states, with_gap
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +32,19 @@ def with_arm(state, name, **fields):
 def with_scene(state, **fields):
     scene = replace(state.world.scene, **fields)
     return replace(state, world=replace(state.world, scene=scene))
+
+
+def with_endoscope_across(state, beside_mm):
+    """The endoscope straight across the first laser, 20 mm from its tip, so far beside the beam."""
+    arm = state.world.arms["laser_1"]
+    middle = arm.tip_mm + 20.0 * arm.tip_direction
+    across = torch.linalg.cross(arm.tip_direction, torch.eye(3)[2:].expand(2, 3))
+    across = torch.nn.functional.normalize(across, dim=1)
+    beside = torch.linalg.cross(arm.tip_direction, across)
+    count = state.world.arms["endoscope"].line_mm.shape[1]
+    along = torch.linspace(-40.0, 40.0, count)[None, :, None] * across[:, None]
+    line = (middle + beside_mm * beside)[:, None] + along
+    return with_arm(state, "endoscope", line_mm=line)
 
 
 def test_the_script_cuts_the_ring_with_both_beams_in_half_the_time(quick, cut):
@@ -96,21 +109,64 @@ def test_no_beam_passes_near_another_arm(quick, cut):
     state = cut[0][40]
     free = quick.beam_clearance_mm(state)
     assert (free > quick.config.beam_mm).all()
-    arm = state.world.arms["laser_1"]
-    middle = arm.tip_mm + 20.0 * arm.tip_direction
-    across = torch.linalg.cross(arm.tip_direction, torch.eye(3)[2:].expand(2, 3))
-    across = torch.nn.functional.normalize(across, dim=1)
-    beside = torch.linalg.cross(arm.tip_direction, across)
-    count = state.world.arms["endoscope"].line_mm.shape[1]
-    along = torch.linspace(-40.0, 40.0, count)[None, :, None] * across[:, None]
-    line = (middle + 9.5 * beside)[:, None] + along
-    near = with_arm(state, "endoscope", line_mm=line)
+    near = with_endoscope_across(state, 9.5)
     clear = quick.beam_clearance_mm(near)
     torch.testing.assert_close(clear[:, 0], torch.full((2,), 2.0), rtol=0, atol=1e-3)
     assert quick.released(near).tolist() == [[False, bool(c >= 3.0)] for c in clear[:, 1]]
     for laser in LASERS:
         assert quick.rewards(near)[laser]["crossed"].tolist() == [-1.0, -1.0]
         assert quick.rewards(state)[laser]["crossed"].tolist() == [0.0, 0.0]
+
+
+def test_one_beam_near_an_arm_is_crossed_for_both(quick, cut):
+    """The endoscope on the other side of the first beam: 2 mm from it, over 10 mm from the second;
+    both lasers pay."""
+    state = cut[0][40]
+    near = with_endoscope_across(state, -9.5)
+    clear = quick.beam_clearance_mm(near)
+    torch.testing.assert_close(clear[:, 0], torch.full((2,), 2.0), rtol=0, atol=1e-3)
+    assert (clear[:, 1] > 10.0).all()
+    for laser in LASERS:
+        assert quick.rewards(near)[laser]["crossed"].tolist() == [-1.0, -1.0]
+
+
+def test_each_laser_is_paid_for_its_own_beam(quick, cut):
+    """In one episode the first beam is on, in the other none; the endoscope has half of one."""
+    state = cut[0][40]
+    fired = torch.tensor([[True, False], [False, False]])
+    found = quick.rewards(replace(state, goal=replace(state.goal, fired=fired)))
+    assert found["laser_1"]["cut"].tolist() == [1.0, 0.0]
+    assert found["laser_2"]["cut"].tolist() == [0.0, 0.0]
+    assert found["endoscope"]["cut"].tolist() == [0.5, 0.0]
+
+
+def test_the_endoscope_is_paid_for_the_targets_it_sees(quick, cut):
+    """Both targets in one episode, none in the other; then the first one alone in both."""
+    state = cut[0][40]
+    view, goal = state.world.scene.views["endoscope"], state.goal
+    visible = torch.ones_like(view.visible)
+    visible[1] = False
+    some = with_scene(state, views={"endoscope": replace(view, visible=visible)})
+    assert quick.rewards(some)["endoscope"]["spots"].tolist() == [1.0, 0.0]
+    count = visible.shape[1]
+    spot = (goal.share(1, quick.round) * count).floor().long() % count
+    visible = torch.ones_like(view.visible)
+    visible[torch.arange(2), spot] = False
+    one = with_scene(state, views={"endoscope": replace(view, visible=visible)})
+    assert quick.rewards(one)["endoscope"]["spots"].tolist() == [0.5, 0.5]
+
+
+def test_a_whole_ring_is_no_success_with_contact_or_a_gap(quick, cut):
+    """Of two cut rings: one with an arm 0.1 mm inside the organ, then one with a station uncut."""
+    state = cut[0][-1]
+    assert quick.measures(state)["success"].tolist() == [1.0, 1.0]
+    clearance = state.world.scene.clearance
+    bodies = clearance.bodies_mm.clone()
+    bodies[1, 0, 0] = -0.1
+    touching = with_scene(state, clearance=replace(clearance, bodies_mm=bodies))
+    assert quick.measures(touching)["collided"].tolist() == [0.0, 1.0]
+    assert quick.measures(touching)["success"].tolist() == [1.0, 0.0]
+    assert quick.measures(with_gap(state, 0))["success"].tolist() == [0.0, 1.0]
 
 
 def test_other_scenes_are_one_line(tmp_path):

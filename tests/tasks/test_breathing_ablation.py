@@ -22,6 +22,7 @@ from surgisoft.tasks.episodes.log import EpisodeRecorder
 from surgisoft.tasks.world.pytree import rows
 from surgisoft.tasks.world.random_streams import streams
 from surgisoft.tasks.world.respiration import Respiration, lujan
+from tests.tasks.scripted import with_gap
 
 PLACE = open_scene(PHANTOM)
 QUICK = BreathingAblationConfig(
@@ -121,6 +122,14 @@ def test_the_expert_cuts_the_ring_while_it_moves(task, cut):
     assert np.quantile(np.abs(patch.offset_mm[burnt]), 0.99) < 0.6, "on the tissue, not in space"
     errors = torch.stack([outcome.measures["tissue_error_mm"] for outcome in outcomes])
     assert errors.nanmean() < 0.1
+
+
+def test_a_ring_with_a_gap_is_no_success(task, cut):
+    """Two cut rings, one with a station uncut; untouched tissue at the start."""
+    states, outcomes = cut
+    assert task.measures(with_gap(states[-1], 0))["success"].tolist() == [0.0, 1.0]
+    assert outcomes[0].measures["completion"].tolist() == [0.0, 0.0]
+    assert outcomes[0].measures["success"].tolist() == [0.0, 0.0]
 
 
 def test_a_log_holds_the_motion_and_shows_the_cut_on_the_organ(task, cut, tmp_path):

@@ -13,6 +13,7 @@ from surgisoft.tasks.contour_ablation import ContourAblation, ContourAblationCon
 from surgisoft.tasks.trajectories.routes import draw_route
 from surgisoft.tasks.world.random_streams import streams
 from surgisoft.tasks.world.treatment import Stretch
+from tests.tasks.scripted import with_gap
 
 LINES = (
     ContourSpec("left", ((-51.0, -21.4, 73.7), (-48.2, -21.7, 74.2)), closed=False),
@@ -66,6 +67,17 @@ def test_the_expert_cuts_every_contour_and_nothing_between(task, cut):
     for column in order.T:
         on_second = column >= first
         assert on_second.int().diff().ge(0).all(), "the second after the first"
+
+
+def test_contours_with_a_gap_are_no_success(task, cut):
+    """A station of the first contour uncut in one of two episodes; the first contour alone cut."""
+    state = cut[0][-1]
+    assert task.measures(with_gap(state, 1))["success"].tolist() == [1.0, 0.0]
+    half = next(
+        outcome.measures for outcome in cut[1] if (outcome.measures["completion"] >= 0.5).any()
+    )
+    assert (half["completion"] < 1.0).all()
+    assert half["success"].tolist() == [0.0, 0.0]
 
 
 def test_the_endoscope_has_to_move_along(task, cut):

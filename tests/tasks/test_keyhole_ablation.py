@@ -44,6 +44,19 @@ def test_the_script_enters_looks_and_cuts(quick, cut):
     assert not fired[:46].any(), "no beam before the arms are in"
 
 
+def test_no_beam_while_the_arms_are_fed_in(quick, cut):
+    """A state with the beam on, but for the carriage of one episode 0.1 mm behind its place."""
+    state = next(state for state in cut[0] if quick.fires(state).all())
+    out = torch.tensor([0.1, 0.0])
+    behind = replace(state, world=replace(state.world, out_mm=out))
+    assert quick.released(behind).all()
+    assert quick.fires(behind).tolist() == [False, True]
+    before = state.world.scene.dose.delivered_j.clone()
+    after = quick.advance(behind, {name: torch.zeros(2, 3) for name in quick.agents})
+    assert after.goal.fired.tolist() == [False, True]
+    assert ((after.world.scene.dose.delivered_j - before) > 0.0).tolist() == [False, True]
+
+
 def test_the_feed_brings_the_bases_to_their_mounts_along_the_ports(quick, cut):
     """By hand: 70 mm behind the mounts, 10 steps of waiting, 2 mm in a step; tips begin outside."""
     states, _ = cut

@@ -19,7 +19,7 @@ from surgisoft.experiments.run import roll_out_block
 from surgisoft.experiments.spec import Fault, load_experiment
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.circle_ablation import CircleAblation
-from surgisoft.tasks.laser_supervision import LaserSupervision
+from surgisoft.tasks.laser_supervision import LASER_EXPERIMENT, LaserSupervision
 from tests.experiments.tiny import FAULT, TINY, write
 
 
@@ -126,6 +126,25 @@ def test_a_condition_has_to_hold_without_a_break(cutting, base, spec):
     goal = _walk(task, replace(state, goal=goal), 1, **good)
     assert goal.phase.tolist() == [0, 0]
     assert _walk(task, replace(state, goal=goal), 1, **good).phase.tolist() == [1, 1]
+
+
+def test_every_laser_has_to_be_out_and_the_endoscope_need_not():
+    """Both lasers within 0.9 kPa of their start; the first, then the second one 1.1 kPa away; the
+    endoscope 30 kPa away."""
+    first = torch.tensor([1.0, 2.0, 3.0])
+    off = {
+        "laser_1": torch.tensor([[0.9, 0.0, 0.0], [0.0, -1.1, 0.0], [0.0, 0.0, 0.0]]),
+        "laser_2": torch.tensor([[0.0, 0.0, -0.9], [0.0, 0.0, 0.0], [1.1, 0.0, 0.0]]),
+        "endoscope": torch.full((3, 3), 30.0),
+    }
+    arms = {name: SimpleNamespace(seen_kPa=first + away) for name, away in off.items()}
+    state = SimpleNamespace(world=SimpleNamespace(arms=arms))
+    mounted = {name: SimpleNamespace(first=first) for name in arms}
+    task = SimpleNamespace(world=SimpleNamespace(arms=mounted))
+    retracted = LASER_EXPERIMENT.conditions["retracted"]
+    assert retracted.within == 1.0
+    assert retracted.holds(task, state, 1.0).tolist() == [True, False, False]
+    assert retracted.holds(task, state, 0.5).tolist() == [False, False, False]
 
 
 def test_a_lost_chamber_stops_the_beam_within_one_step(tmp_path):

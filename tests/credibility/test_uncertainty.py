@@ -12,6 +12,7 @@ from surgisoft.diagnosis.residuals import residual_table
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.arm import ArmSpec
+from surgisoft.surrogate.effects import ArmFacts, make_effect
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import HawEnsemble, HawNN
 from surgisoft.surrogate.training_residuals import TrainingResiduals
@@ -62,6 +63,35 @@ def test_inputs_go_through_the_slope_and_noise_has_three_coordinates():
     whole = np.sqrt(3 * NOISE_MM**2 + 0.2**2 + 0.3**2)
     assert tip.expanded_mm == pytest.approx(1.959964 * whole, rel=1e-3)
     assert found.body.input_mm == pytest.approx(0.2 / np.sqrt(2.0), rel=1e-3)
+
+
+def test_steps_of_time_are_as_uncertain_as_halving_them_says():
+    """A lag of 0.5 s on a ramp of 0.5 kPa/s: held commands lag by a r h / (1 - a), a = e^(-h/tau).
+
+    From rest the gap to the limit decays by a in each step of h, whether in one or in two.
+    """
+    tau_s, rate, h_s, count = 0.5, 0.5, 0.1, 200
+    ramp = np.zeros((count, 2))
+    ramp[:, 0] = rate * h_s * np.arange(count)
+    some = [dataclasses.replace(recording(count), measured=ramp)]
+    rest = torch.zeros(2)
+    facts = ArmFacts(rest, torch.full((2,), 10.0), rest, REST)
+    lag = make_effect("line_lag", facts, up_s=tau_s, down_s=tau_s, dead_s=1e-4, turn=1e6)
+    lag.amplitudes()["share"].data.fill_(1.0)
+    arm = model(linear_network(2.0)).replace(effects={"line_lag": lag.requires_grad_(False)})
+
+    def lag_kPa(step_s):
+        kept = np.exp(-step_s / tau_s)
+        return kept * rate * step_s / (1.0 - kept)
+
+    grown = 1.0 - np.exp(-h_s * np.arange(count) / tau_s)
+    change_mm = 2.0 * (lag_kPa(h_s / 2.0) - lag_kPa(h_s)) * grown
+    found = budget(residual_table(arm, some), some, Uncertainty(input=(0.1,)))
+    base, tip = found.per_key_point
+    expected = 1.5 * np.sqrt(np.mean(change_mm**2))
+    assert expected == pytest.approx(1.5 * 2.0 * rate * h_s / 4.0, rel=0.1), "to first order"
+    assert tip.numerical_mm == pytest.approx(expected, rel=2e-3)
+    assert base.numerical_mm == pytest.approx(0.0, abs=1e-6)
 
 
 def test_stated_noise_counts_and_one_input_stands_for_all():

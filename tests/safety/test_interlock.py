@@ -17,9 +17,12 @@ from surgisoft.experiments.spec import load_experiment
 from surgisoft.rig import SafeRig, VirtualRig
 from surgisoft.rig.safety import RigStopped, Safety
 from surgisoft.tasks.base import Episodes
+from surgisoft.tasks.breathing_ablation import BreathingAblation, BreathingAblationConfig
+from surgisoft.tasks.keyhole_ablation import KeyholeAblation, KeyholeAblationConfig
 from surgisoft.tasks.path_following import FollowConfig
 from surgisoft.tasks.registry import TASKS
 from surgisoft.tasks.track import TrackConfig, track_circle
+from surgisoft.tasks.world.respiration import Breaths
 from tests.experiments.tiny import TINY, write
 
 RIG = RigConfig(seed=1, settle_s=0.2)
@@ -27,7 +30,8 @@ RIG = RigConfig(seed=1, settle_s=0.2)
 
 LONGER = {"breathing_ablation", "contour_ablation", "keyhole_ablation"}
 """Tasks that `python -m benchmarks.interlock` attacks and the suite does not: their beam is
-released by the same function as that of circle_ablation, and they take longer until it is on."""
+released by the same function as that of circle_ablation, and they take longer until it is on. What
+breathing_ablation and keyhole_ablation ask for beside it has its own tests below."""
 
 
 @pytest.mark.parametrize("name", sorted({*laser_tasks()} - LONGER))
@@ -142,6 +146,83 @@ def test_the_beam_needs_every_condition_at_once(phased, start, flaws, room):
     world = replace(start.world, failed=column["failed"])
     task.advance(replace(start, goal=goal, world=world), {})
     assert supervision.let_on.tolist() == [not flaw for flaw in flaws]
+
+
+class GatedDrawn(BreathingAblation):
+    """The beam in the gate, with an answer of `released` that is drawn."""
+
+    def released(self, state):
+        """(B,) bool: what was drawn."""
+        return self.drawn
+
+
+class FedDrawn(KeyholeAblation):
+    """The beam of arms that are fed in, with an answer of `released` that is drawn."""
+
+    def released(self, state):
+        """(B,) bool: what was drawn."""
+        return self.drawn
+
+
+GATE_MM = 1.5
+
+
+@pytest.fixture(scope="module")
+def gated():
+    task = GatedDrawn(BreathingAblationConfig(mode="gated", gate_mm=GATE_MM))
+    return task, Episodes(task).seeded(0, 1)
+
+
+@pytest.fixture(scope="module")
+def fed():
+    task = FedDrawn(KeyholeAblationConfig())
+    return task, Episodes(task).seeded(0, 1)
+
+
+BREATH = st.fixed_dictionaries(
+    {
+        "amplitude": st.floats(1.0, 25.0),
+        "period": st.floats(1.5, 8.0),
+        "at": st.floats(0.0, 0.999),
+        "released": st.booleans(),
+    }
+)
+"""A breath (mm, s), what share of it has passed, and whether all else releases the beam."""
+
+
+@settings(deadline=None)
+@example(breaths=[{"amplitude": 12.0, "period": 4.0, "at": 0.5, "released": True}])
+@example(breaths=[{"amplitude": 12.0, "period": 4.0, "at": 0.0, "released": True}])
+@given(breaths=st.lists(BREATH, min_size=1, max_size=8))
+def test_the_beam_is_never_on_outside_of_the_gate(gated, breaths):
+    """Lujan's law from the end of exhalation: b sin^2n(pi t / tau) within gate_mm, or no beam."""
+    task, state = gated
+    column = {name: torch.tensor([each[name] for each in breaths]) for name in breaths[0]}
+    amplitude, period, at = (column[name] for name in ("amplitude", "period", "at"))
+    breath = Breaths(0.0 * period[:, None], period[:, None], amplitude[:, None], at * period)
+    scene = replace(state.world.scene, breaths=breath)
+    task.drawn = released = column["released"]
+    on = task.fires(replace(state, world=replace(state.world, scene=scene)))
+    n = task.config.respiration.asymmetry
+    moved_mm = amplitude.double() * (math.pi * at.double()).sin() ** (2 * n)
+    assert not on[moved_mm > GATE_MM + 1e-3].any()
+    assert not on[~released].any()
+    assert on[released & (moved_mm < GATE_MM - 1e-3)].all()
+
+
+OUT_MM = st.one_of(st.sampled_from([0.0, 1e-6, 80.0, math.nan]), st.floats(0.0, 200.0, width=32))
+"""Distance of the carriages behind their mounts, mm."""
+
+
+@settings(deadline=None)
+@example(arms=[(0.0, True), (1e-6, True), (math.nan, True), (0.0, False)])
+@given(arms=st.lists(st.tuples(OUT_MM, st.booleans()), min_size=1, max_size=8))
+def test_the_beam_is_never_on_while_the_arms_are_fed_in(fed, arms):
+    task, state = fed
+    task.drawn = torch.tensor([released for _, released in arms])
+    out_mm = torch.tensor([out for out, _ in arms])
+    on = task.fires(replace(state, world=replace(state.world, out_mm=out_mm)))
+    assert on.tolist() == [released and out == 0.0 for out, released in arms]
 
 
 def test_a_command_that_is_no_number_ends_an_episode_with_the_beam_off():

@@ -86,7 +86,7 @@ FLOORS = {
         ("pages",),
     ),
     "credibility": (
-        ("context", "metrics"),
+        ("context", "metrics", "software"),
         ("uncertainty", "retest", "domain"),
         ("scenario",),
         ("assessment",),

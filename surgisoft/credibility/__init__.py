@@ -2,7 +2,7 @@
 
 `context` reads what the user states, `metrics` compares numbers, `uncertainty` finds what may
 differ without a fault of the model, `retest` compares recordings with each other, `domain` finds
-where a scenario leaves what was validated, `scenario` takes an experiment's results, `assessment`
-puts all together and `page` shows it. The result is in a form usable for such an assessment; it
-is no statement of compliance.
+where a scenario leaves what was validated, `scenario` takes an experiment's results, `software`
+states what computed it, `assessment` puts all together and `page` shows it. The result is in a form
+usable for such an assessment; it is no statement of compliance.
 """

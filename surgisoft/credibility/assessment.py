@@ -1,15 +1,12 @@
 """The whole assessment: a model, its comparators and the context in; numbers for a report out."""
 
 import hashlib
-import platform
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
 
-from surgisoft import __version__
 from surgisoft.credibility.context import Context
 from surgisoft.credibility.domain import Applicability, applicability, states_of
 from surgisoft.credibility.metrics import Criterion, area_in_space
@@ -21,6 +18,7 @@ from surgisoft.credibility.scenario import (
     scenario_states,
     stored_episodes,
 )
+from surgisoft.credibility.software import TESTS, software
 from surgisoft.credibility.uncertainty import Budget, budget
 from surgisoft.diagnosis.compare import Comparison
 from surgisoft.diagnosis.diagnose import Diagnosis, diagnose
@@ -40,8 +38,6 @@ STATEMENT = (
     "who answer for it."
 )
 """What the report is, and what it is not."""
-LIBRARIES = ("torch", "numpy", "scipy", "python-fcl")
-"""Libraries whose versions are stated, beside the package and Python."""
 SAME_RANGE = 0.03
 """How far an input of a comparator may lie outside the model's range, as a share of it, and still
 count as equivalent: the share up to which `compare` gives no note."""
@@ -152,7 +148,7 @@ class Assessment:
     agreement: Agreement | None
     """Agreement with the exact collision checker; None without episodes."""
     software: dict[str, str]
-    """Versions."""
+    """Versions, and the commit of the source code where it is known."""
     criteria: tuple[Criterion, ...]
     """The user's limits and whether they are met."""
     table: ResidualTable
@@ -237,6 +233,7 @@ class Assessment:
                 "agreement": self.agreement
                 and asdict(self.agreement) | {"sentence": self.agreement.sentence},
                 "software": self.software,
+                "software_tests": TESTS,
             }
         )
         return with_former_keys(values, {"took_no_part": "held_out"})
@@ -461,17 +458,6 @@ def fingerprint(recording: Recording) -> str:
     for values in (recording.t_s, recording.measured, recording.key_points_mm):
         digest.update(np.ascontiguousarray(values, "<f8").tobytes())
     return digest.hexdigest()
-
-
-def software() -> dict[str, str]:
-    """Versions of the package, of Python and of the libraries that compute."""
-    found = {"surgisoft": __version__, "python": platform.python_version()}
-    for name in LIBRARIES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found
 
 
 def _length(table: ResidualTable) -> float:

@@ -7,6 +7,7 @@ report states the evidence, or that it has none.
 from dataclasses import asdict, dataclass
 
 from surgisoft.credibility.assessment import Assessment
+from surgisoft.credibility.software import COMMIT
 
 NOT_ASSESSED = "not assessed"
 """Begin of what is said of a factor for which a report has no evidence."""
@@ -60,8 +61,9 @@ def factors(found: Assessment) -> tuple[Factor, ...]:
     domain = f"{NOT_ASSESSED}: no states of the scenario are given"
     if found.applicability is not None:
         domain = found.applicability.sentence
+    stated_of = "versions and commit" if COMMIT in found.software else "versions"
     versions = (
-        "versions are stated; the source code comes with its tests, their branch coverage and "
+        f"{stated_of} are stated; the source code comes with its tests, their branch coverage and "
         "their mutation tests"
     )
     return (

@@ -7,6 +7,7 @@ import numpy as np
 from surgisoft.credibility.assessment import STATEMENT, Assessment, PointError
 from surgisoft.credibility.domain import NEAR, NEAR_POSE, Applicability, percent
 from surgisoft.credibility.factors import factors
+from surgisoft.credibility.software import COMMIT, TESTS
 from surgisoft.files import write_json
 from surgisoft.report import Facts, Gallery, Page, Picture, Section, Share, Table, Text, write_page
 from surgisoft.report.charts import AMBER, BLUE, CHART, GREEN, RED, chart, drawing
@@ -407,6 +408,9 @@ def _scenario(found: Assessment) -> list[Section]:
 
 def _software(found: Assessment) -> Section:
     parts: list = [Table(["software", "version"], list(found.software.items()))]
+    if COMMIT not in found.software:
+        parts.append(Text("The commit of the source code is not known."))
+    parts.append(Text(TESTS))
     if found.agreement is not None:
         text = found.agreement.sentence
         parts.append(Text(text[:1].upper() + text[1:] + "."))

@@ -8,10 +8,12 @@ from pathlib import Path
 
 import pytest
 
+import surgisoft
 from surgisoft.cli import run
 from surgisoft.credibility.assessment import Assessment, Comparator, PointError, criteria_of
 from surgisoft.credibility.context import Risk, load_context
 from surgisoft.credibility.of_experiment import assess_experiment
+from surgisoft.credibility.software import TESTS, commit_of
 from surgisoft.errors import InputError
 from surgisoft.experiments.results import sum_up
 from surgisoft.experiments.run import run_experiment
@@ -75,7 +77,9 @@ def test_the_report_has_what_both_standards_ask_for(bench):
     assert found["model_form"]["kind"] == found["test_retest"]["diagnoses"][0]["kind"]
     assert found["applicability"]["share"] == 1.0  # its own states
     assert found["passed"] is all(each["passed"] for each in found["criteria"])
-    assert found["software"]["surgisoft"]
+    assert found["software"]["surgisoft"] == surgisoft.__version__
+    assert found["software"].get("commit") == commit_of()
+    assert found["software_tests"] == TESTS
     factors = {each["name"]: each for each in found["credibility_factors"]}
     assert len(factors) == 13
     assert not factors["numerical code verification"]["assessed"]  # the context names no episode
@@ -97,6 +101,8 @@ def test_the_page_says_it_and_escapes_what_the_user_wrote(bench, tmp_path):
     text = (bench / "report/credibility.html").read_text()
     assert "May &lt;b&gt;the tip&lt;/b&gt; be sent there?" in text
     assert "In a form usable for" in text
+    assert "<code>make mutants</code>" in text
+    assert (commit_of() or "The commit of the source code is not known.") in text
     assert not re.search(r"\bcompliant\b|\bcomplies\b", text)
     with chromium() as browser:
         page = bench / "report/credibility.html"

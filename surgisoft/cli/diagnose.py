@@ -122,6 +122,14 @@ def diagnose(
             error_mm=model_error,
         )
     warn_all(found.notes)
+    data = " ".join(map(str, recordings))
+    # Predictions of `--before` come last; no command to run next takes those recordings with them.
+    of_model = model_options((predictions or [])[: len(measured)], model_error)
+    following = ""
+    if found.next_command:
+        command = found.command(str(model), data, " ".join(map(str, before or ())))
+        predicted = bool(predictions) or model.suffix in (".csv", ".parquet")
+        following = _following(command, predicted, of_model)
     written = []
     if json_file:
         write_json(json_file, found.to_json())
@@ -130,7 +138,7 @@ def diagnose(
         from surgisoft.diagnosis.pages.diagnosis import write_report
 
         title = f"{model.name} on {', '.join(recording.name for recording in measured)}"
-        written.append(write_report(found, report, title))
+        written.append(write_report(found, report, title, following))
     if replay and found.track is not None:
         from surgisoft.replay.comparison import write_change
 
@@ -148,32 +156,26 @@ def diagnose(
         corrected = " ".join(map(str, files)) if predictions and len(files) > 1 else corrected
     _show(found)
     show_written(written)
-    data = " ".join(map(str, recordings))
-    # Predictions of `--before` come last; no command to run next takes those recordings with them.
-    of_model = model_options((predictions or [])[: len(measured)], model_error)
     if found.setup:
         _next_after_setup(found.setup, model, data, of_model, corrected if apply else None)
     elif apply:
         print(f"nothing to correct: {apply} was not written")
-    if found.next_command:
-        option = f" --before {' '.join(map(str, before))}" if before else ""
-        command = found.next_command.format(model=model, data=data, before=option)
-        _next(command, bool(predictions) or model.suffix in (".csv", ".parquet"), of_model)
+    if following:
+        print(f"next: {following}")
 
 
-def _next(command: str, predicted: bool, of_model: str) -> None:
-    """Print the command to run next, with the options that say what MODEL is.
+def _following(command: str, predicted: bool, of_model: str) -> str:
+    """The command to run next, with the options that say what MODEL is.
 
     predicted: whether the model is given by predictions, which cannot be amended.
     """
     name = command.split()[1]
     if name == "amend" and predicted:
-        print(
-            "next: give the model as a callable (docs/your_model.md) to amend it: predictions of "
+        return (
+            "give the model as a callable (docs/your_model.md) to amend it: predictions of "
             "recorded rows cannot be amended"
         )
-        return
-    print(f"next: {with_effect_files(command if name == 'fit' else command + of_model)}")
+    return with_effect_files(command if name == "fit" else command + of_model)
 
 
 def _next_after_setup(setup, model: Path, data: str, of_model: str, apply: str | None) -> None:

@@ -221,6 +221,16 @@ class Diagnosis:
         """The rows that errors with an effect are from, in words."""
         return LEFT_OUT if self.in_fit else HELD_OUT
 
+    def command(
+        self, model: str = "MODEL", data: str = "RECORDINGS", before: str = "BEFORE"
+    ) -> str:
+        """`next_command` with its files, in words for those that are not given.
+
+        before: the recordings from before, which are left out where none were compared.
+        """
+        option = f" --before {before}" if self.change is not None else ""
+        return self.next_command.format(model=model, data=data, before=option)
+
     @property
     def shown(self) -> tuple[Ranked, ...]:
         """The ranking in the order of tables and charts: by confidence as it is printed, then by

@@ -1,5 +1,6 @@
 """What commands print of a result, with the work behind them replaced by results by hand."""
 
+import html
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from surgisoft.cli import run
+from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Ranked, Verdict
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import Recording, save_recording
 
@@ -130,15 +132,20 @@ def found_setup(**fields) -> SimpleNamespace:
     return SimpleNamespace(**(values | fields))
 
 
+CHANGE = SimpleNamespace(sentence="moved by 0.9 mm", stretches=())
+
+
 def diagnosis(**fields) -> SimpleNamespace:
     values = {
         "verdict": SimpleNamespace(kind="setup", sentence="the frame is turned"),
         "error_mm": SimpleNamespace(before=0.5, floor=0.05, best_achievable=0.1), "track": None,
         "setup": None, "next_command": "", "next_experiment": None, "refit": None, "checks": (),
         "shown": (), "not_testable": (), "seconds": 1.5, "in_fit": 0.0,
-        "left_out": "held-out blocks",
+        "left_out": "held-out blocks", "change": None,
     }  # fmt: skip
-    return result(**(values | fields))
+    found = result(**(values | fields))
+    found.command = lambda *files: Diagnosis.command(found, *files)
+    return found
 
 
 def test_diagnose_prints_what_mends_a_set_up(bench, tmp_path, capsys, monkeypatch):
@@ -188,7 +195,7 @@ def test_diagnose_prints_candidates_and_the_next_step(bench, capsys, monkeypatch
         verdict=SimpleNamespace(kind="ambiguous", sentence="creep or leak"), refit=refit,
         shown=[row], checks=("the clock is even",), next_experiment=plan,
         not_testable=[SimpleNamespace(effect="drift", reason="too short")],
-        next_command="surgisoft next-experiment {model} {data}{before} -o NEW.csv",
+        next_command="surgisoft next-experiment {model} {data}{before} -o NEW.csv", change=CHANGE,
     )  # fmt: skip
     rec = str(bench / "bench.parquet")
     target = "surgisoft.diagnosis.diagnose.diagnose"
@@ -210,6 +217,33 @@ def test_diagnose_prints_candidates_and_the_next_step(bench, capsys, monkeypatch
         capsys, monkeypatch, target, diagnosis(refit=plain), "diagnose", "default", rec
     )  # fmt: skip
     assert "not tried" not in shown
+
+
+@pytest.mark.parametrize("change", [None, CHANGE])
+def test_the_page_of_a_diagnosis_has_the_command_that_is_printed(
+    change, bench, tmp_path, capsys, monkeypatch
+):
+    """With the recordings from before, without which it would explain something else."""
+    found = Diagnosis(
+        Verdict("identified", ("payload",), "payload is missing", 0.9),
+        ErrorLevels(0.5, 0.1, 0.05),
+        (Ranked("payload", 0.9, 0.5, 0.5, 0.1, (0.1, 0.2), 0.01, 1.0, {"mass_g": 90.0}),),
+        next_command="surgisoft amend {model} --effect payload --data {data}{before} -o NEW",
+        change=change,
+    )
+    rec, page = str(bench / "bench.parquet"), tmp_path / "page"
+    before = ["--before", rec] if change else []
+    out = printed(
+        capsys, monkeypatch, "surgisoft.diagnosis.diagnose.diagnose", found,
+        "diagnose", "default", rec, *before, "--report", str(page),
+    )  # fmt: skip
+    command = f"surgisoft amend default --effect payload --data {rec}"
+    command += f" --before {rec} -o NEW" if change else " -o NEW"
+    assert out.endswith(f"next: {command}\n")
+    words = re.sub(r"<[^>]*>", "", (page / "diagnosis.html").read_text())
+    assert command in html.unescape(words)
+    end = " --before BEFORE -o NEW" if change else " -o NEW"
+    assert found.command().endswith(f"--data RECORDINGS{end}")
 
 
 PARAMETER = SimpleNamespace(

@@ -378,8 +378,7 @@ def _left(result: Improvement) -> Section:
         text = f"Record next: {plan.name}, {plan.minutes:g} minutes; it distinguishes {pairs}."
         parts.append(Text(text))
     if last.next_command and not (result.steps and "amend" in last.next_command):
-        command = last.next_command.format(model="NEW", data="REC", before="")
-        parts.append(Command(command))
+        parts.append(Command(last.command("NEW", "REC")))
     if last.not_testable:
         rows = [(each.effect, each.reason) for each in last.not_testable]
         text = (

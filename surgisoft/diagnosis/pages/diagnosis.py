@@ -58,8 +58,11 @@ LEAST_POINTS = 10
 """Fewest rows of a stretch."""
 
 
-def diagnosis_page(found: Diagnosis, title: str) -> Page:
-    """The page of a diagnosis."""
+def diagnosis_page(found: Diagnosis, title: str, command: str = "") -> Page:
+    """The page of a diagnosis.
+
+    command: what to do, with the names of the files; default: with words for them.
+    """
     error, verdict = found.error_mm, found.verdict
     facts = [
         ("error", f"{error.before:.3f} mm"),
@@ -85,8 +88,7 @@ def diagnosis_page(found: Diagnosis, title: str) -> Page:
         if found.probabilities:
             parts.append(_probabilities(found.probabilities))
         if found.next_command:
-            command = found.next_command.format(model="MODEL", data="RECORDINGS", before="")
-            parts.append(Section("What to do", [Command(command)]))
+            parts.append(Section("What to do", [Command(command or found.command())]))
     if found.change:
         parts.append(_change(found))
     if found.refit is not None:
@@ -332,9 +334,9 @@ def _chart(found: Diagnosis):
         return chart(figure, "Held-out error with each effect")
 
 
-def write_report(found: Diagnosis, folder: Path, title: str) -> Path:
-    """Write `diagnosis.html` into a folder; returns its path."""
+def write_report(found: Diagnosis, folder: Path, title: str, command: str = "") -> Path:
+    """Write `diagnosis.html` into a folder; returns its path. command: as for the page."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "diagnosis.html"
-    write_page(diagnosis_page(found, title), path)
+    write_page(diagnosis_page(found, title, command), path)
     return path

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from surgisoft.extras import EXTRA_OF, EXTRA_OF_USE
+import surgisoft.extras as extras_
+from surgisoft.extras import EXTRA_OF, EXTRA_OF_USE, missing_library
 
 ROOT = Path(__file__).resolve().parents[1]
 WITHOUT = """
@@ -151,3 +152,41 @@ print(run("evaluate scripted --task track_circle --episodes 1 --json x.json".spl
 def test_python_names_the_extra_too(said):
     assert "surgisoft.parallel_env: the package" in said["python"][1]
     assert "pip install 'surgisoft[train]'" in said["python"][1]
+
+
+def test_a_part_of_the_package_names_its_extra_too():
+    """Imported by itself, by a program that passes no function of the package."""
+    done = core("import surgisoft.agents.policies")
+    assert done.returncode == 1
+    last = done.stderr.splitlines()[-1]
+    assert "the package 'embreex' is missing" in last
+    assert "pip install 'surgisoft[scene]'" in last
+
+
+def of_metadata(monkeypatch, package, installed, asked):
+    """As if this version of a package were installed, and surgisoft asked for that one."""
+    monkeypatch.setattr(extras_, "packages_distributions", lambda: {package: [package]})
+    monkeypatch.setattr(extras_, "version", lambda name: {package: installed}[name])
+    monkeypatch.setattr(extras_, "requires", lambda name: ["numpy>=2.0", asked])
+
+
+def test_a_package_without_a_part_is_too_old_and_not_missing(monkeypatch):
+    module = "onnxscript._framework_apis.torch_2_11"
+    error = ModuleNotFoundError(f"No module named '{module}'", name=module)
+    of_metadata(monkeypatch, "onnxscript", "0.5.4", 'onnxscript>=0.6; extra == "train"')
+    assert missing_library(error, "export") == (
+        "the package 'onnxscript' 0.5.4 is too old, expected 0.6 or later: it has no module "
+        f"'{module}'; install it with: pip install --upgrade 'onnxscript>=0.6'"
+    )
+    of_metadata(monkeypatch, "onnxscript", "0.10.1", 'onnxscript>=0.6; extra == "train"')
+    assert "0.10.1 is too old, or not whole: it has no" in missing_library(error)
+    whole = ModuleNotFoundError("No module named 'onnxscript'", name="onnxscript")
+    assert "'onnxscript' is missing" in missing_library(whole)
+
+
+def test_the_export_asks_for_an_onnxscript_that_torch_takes():
+    """0.5.4 has no part for torch 2.11 and later, which the first bound allowed."""
+    (asked,) = [line for line in extras()["train"] if plain(line) == "onnxscript"]
+    least = tuple(map(int, asked.partition(">=")[2].split(".")))
+    pinned = (ROOT / "constraints.txt").read_text().partition("\nonnxscript==")[2].split()[0]
+    assert (0, 6) <= least <= tuple(map(int, pinned.split(".")))

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 
-import fcl
 import numpy as np
 import torch
 
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.extras import with_advice
 from surgisoft.scene import frames
 from surgisoft.scene.bvh import STACK, TriangleTree, build_tree
 from surgisoft.scene.capsules import (
@@ -42,6 +42,9 @@ from surgisoft.scene.inside import points_inside
 from surgisoft.scene.mesh import Body, Mesh
 from surgisoft.scene.moving import Placement
 from surgisoft.scene.rays import RayHit, Struck, struck_of
+
+with with_advice():
+    import fcl
 
 PROBE_WIDTH_MM = 1e-3
 """Width of the triangle that represents a ray; without it FCL misses one hit in six (mm)."""

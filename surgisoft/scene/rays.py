@@ -14,12 +14,15 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 
 from surgisoft.compiled import compiled
+from surgisoft.extras import with_advice
 from surgisoft.scene.bvh import STACK, line_triangle, triangle
 from surgisoft.scene.mesh import Body, Mesh
+
+with with_advice():
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
 
 
 class Struck(IntEnum):

@@ -34,8 +34,11 @@ MOST_ROWS = 6000
 """Longer comparisons are thinned evenly to so many rows."""
 LINE_MM = 2.0
 """Spacing of the drawn centreline's points (mm)."""
-MEASURED_WIDE, PREDICTED_WIDE, POINT_WIDE, ARROW_WIDE, BAR_WIDE = 0.012, 0.006, 0.014, 0.006, 0.005
-"""Radii of what is drawn, as shares of the body's length: a short and a long arm look alike."""
+MEASURED_WIDE, PREDICTED_WIDE, POINT_WIDE, ARROW_WIDE, BAR_WIDE = 0.008, 0.012, 0.014, 0.006, 0.005
+"""Radii of what is drawn, as shares of the body's length: a short and a long arm look alike. The
+second body is dashed and thicker, so that both are seen where one lies in the other."""
+DASHES, DASH_SHARE, DASH_POINTS = 12, 0.4, 4
+"""Dashes along a body, how much of their spacing they fill, and the points of each."""
 SEEN, EVENTS = "/seen", "/events"
 """Entities of the text panel and of the events."""
 
@@ -59,9 +62,10 @@ def write_comparison(
     (S, n, 3) are in the base frame, nan where missing; predicted_mm of several models by their
     names are shown side by side, with one scale of their errors. pressure (S, m) in `unit` is
     plotted if given. `name` describes the comparison, `seen` is Markdown that says what is seen,
-    and the times of `events` are on the axis of `continued`. The bodies nearly coincide, so each
-    error is also drawn as an arrow from measured to predicted, magnified, and coloured from none to
-    `large_mm` (default: the 95 % quantile of the worst model, rounded up).
+    and the times of `events` are on the axis of `continued`. The bodies nearly coincide, so the
+    predicted one is dashed, and each error is also drawn as an arrow from measured to predicted,
+    magnified, and coloured from none to `large_mm` (default: the 95 % quantile of the worst model,
+    rounded up).
     """
     began, path = time.perf_counter(), Path(path)
     models = predicted_mm if isinstance(predicted_mm, Mapping) else {"model": predicted_mm}
@@ -86,7 +90,7 @@ def write_comparison(
         _log_bars(recording, measured, scale)
         for number, (label, points) in enumerate(models.items(), 1):
             where, colour = f"/model{number}", rgb(model_colour(number - 1))
-            _log_body(columns, where, points, colour, PREDICTED_WIDE * body)
+            _log_body(columns, where, points, colour, PREDICTED_WIDE * body, dashed=True)
             _log_errors(columns, where, measured, points, errors[label], scale)
         for line in (line for group in lines.values() for line in group):
             columns.plot(line)
@@ -115,9 +119,10 @@ def write_change(
     """Write key points before and after a change, and what effects explain of it, as an .rrd file.
 
     t_s (S,) s; a new run begins where it decreases. before_mm, after_mm (S, n, 3) key points in the
-    base frame, nan where missing; explained_mm (S, n, 3) the explained change. Both changes are
-    drawn as arrows from the body before, magnified by the factor in the view's title: the measured
-    one in the colour of the body after, the explained one in that of a plan.
+    base frame, nan where missing; explained_mm (S, n, 3) the explained change. The body after is
+    dashed. Both changes are drawn as arrows from the body before, magnified by the factor in the
+    view's title: the measured one in the colour of the body after, the explained one in that of a
+    plan.
     """
     began, path = time.perf_counter(), Path(path)
     given = (t_s, before_mm, after_mm, explained_mm)
@@ -148,7 +153,7 @@ def write_change(
         columns = Columns(recording, time_s)
         recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         _log_body(columns, "/before", before, MEASURED_COLOUR, MEASURED_WIDE * body)
-        _log_body(columns, "/after", after, REAL_COLOUR, PREDICTED_WIDE * body)
+        _log_body(columns, "/after", after, REAL_COLOUR, PREDICTED_WIDE * body, dashed=True)
         _log_arrows(columns, "/change/measured", before, stretch * change, REAL_COLOUR, body)
         _log_arrows(columns, "/change/explained", before, stretch * explained, PLAN_COLOUR, body)
         for line in (line for group in lines.values() for line in group):
@@ -227,7 +232,9 @@ def _break_at_pauses(columns: Columns, entity: str) -> None:
         columns.recording.send_columns(entity, indexes=times, columns=nothing)
 
 
-def _log_body(columns: Columns, entity: str, points, colour, radius: float) -> None:
+def _log_body(
+    columns: Columns, entity: str, points, colour, radius: float, *, dashed: bool = False
+) -> None:
     """Log a spline through the key points of each row in which all are known and distinct."""
     apart = (np.linalg.norm(np.diff(points, axis=1), axis=-1) > 1e-6).all(1)
     rows = np.flatnonzero(np.isfinite(points).all((1, 2)) & apart)
@@ -235,8 +242,20 @@ def _log_body(columns: Columns, entity: str, points, colour, radius: float) -> N
         return
     style = rr.LineStrips3D.from_fields(colors=colour, radii=radius)
     columns.recording.log(f"{entity}/body", style, static=True)
-    strips = [finer(points[row], LINE_MM).astype(np.float32) for row in rows]
-    columns.send(f"{entity}/body", rows, rr.LineStrips3D.columns(strips=strips))
+    lines = [finer(points[row], LINE_MM).astype(np.float32) for row in rows]
+    strips = [dash for line in lines for dash in dashes(line)] if dashed else lines
+    counts = np.full(len(rows), DASHES if dashed else 1)
+    columns.send(f"{entity}/body", rows, rr.LineStrips3D.columns(strips=strips).partition(counts))
+
+
+def dashes(line_mm: np.ndarray) -> np.ndarray:
+    """Dashes (DASHES, DASH_POINTS, 3) along a line (K, 3), the first from its begin, the last to
+    its end."""
+    along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(line_mm, axis=0), axis=1))]
+    begin = np.arange(DASHES)[:, None] + DASH_SHARE * np.linspace(0.0, 1.0, DASH_POINTS)
+    places = begin * along[-1] / (DASHES - 1 + DASH_SHARE)
+    found = [np.interp(places, along, values) for values in line_mm.T]
+    return np.stack(found, axis=-1).astype(np.float32)
 
 
 def _log_errors(columns: Columns, where: str, measured, predicted, error, scale: Scale) -> None:

@@ -30,7 +30,10 @@ def legend_picture(names: Sequence[str], scale: Scale) -> bytes:
     height = min(1.0 / (len(rows) + 1), 0.25)
     for place, (text, colour) in enumerate(rows):
         y = 1.0 - height * (place + 0.5)
-        axis.plot((0.0, 0.10), (y, y), color=colour, lw=5, solid_capstyle="round")
+        style = {"lw": 4, "solid_capstyle": "round"}
+        if place:  # dashed as in the view in space
+            style = {"lw": 6, "ls": (0.0, (0.7, 0.7)), "dash_capstyle": "butt"}
+        axis.plot((0.0, 0.10), (y, y), color=colour, **style)
         axis.text(0.14, y, text, color=INK, va="center", fontsize=10)
     y = 1.0 - height * (len(rows) + 0.5)
     arrow = {"arrowstyle": "-|>", "color": _unit(ERROR_STOPS[2]), "lw": 2.5}

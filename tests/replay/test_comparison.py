@@ -48,6 +48,28 @@ def test_errors_are_arrows_from_measured_to_predicted(tmp_path):
     np.testing.assert_allclose(np.array(bodies[0][0])[[0, -1]], measured[0][[0, -1]], atol=1e-4)
 
 
+@pytest.mark.parametrize("apart_mm", [0.0, 0.5])
+def test_both_bodies_are_seen_where_they_nearly_coincide(tmp_path, apart_mm):
+    """A thicker body around the other leaves parts of it free; both end at base and tip."""
+    path = tmp_path / "c.rrd"
+    measured = np.zeros((2, 4, 3))
+    measured[..., 2] = np.linspace(0.0, 70.0, 4)
+    predicted = measured + np.array([apart_mm, 0.0, 0.0])
+    write_comparison(np.arange(2.0), measured, predicted, "m on r", path)
+    (solid,) = column(path, "/measured/body", "LineStrips3D:strips")[1]
+    dashed = np.array(column(path, "/model1/body", "LineStrips3D:strips")[1])
+    ends = dashed[:, [0, -1]]
+    np.testing.assert_allclose(dashed[..., 0], apart_mm, atol=1e-6)
+    assert (ends[0, 0, 2], ends[-1, 1, 2]) == (pytest.approx(0.0), pytest.approx(70.0))
+    free = ends[1:, 0, 2] - ends[:-1, 1, 2]
+    inner = column(path, "/measured/body", "LineStrips3D:radii")[-1][0]
+    outer = column(path, "/model1/body", "LineStrips3D:radii")[-1][0]
+    assert 70.0 * 0.3 < free.sum() < 70.0 * 0.6, "of the measured body between the dashes"
+    assert outer > inner + 0.2
+    assert free.min() > 2 * outer, "wider than the dashes are thick: seen from the side, too"
+    np.testing.assert_allclose(np.array(solid)[[0, -1], 2], [0.0, 70.0], atol=1e-5)
+
+
 def test_several_models_have_one_scale(tmp_path):
     """The model with a tenth of the error is drawn with a tenth of the arrows, and darker."""
     t_s, measured, predicted = made_up()

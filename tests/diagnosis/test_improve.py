@@ -11,10 +11,12 @@ from surgisoft.cli import run
 from surgisoft.diagnosis import improve as loop
 from surgisoft.diagnosis.decision import Probabilities
 from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Ranked, Verdict
-from surgisoft.diagnosis.improve import NETWORK, improve, next_effects
+from surgisoft.diagnosis.improve import NETWORK, Improvement, Round, improve, next_effects
+from surgisoft.diagnosis.pages.amendment import what_is_left
 from surgisoft.diagnosis.residuals import held_out_rows
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import save_recording
+from surgisoft.report import Text
 from surgisoft.surrogate.checkpoint import load_model, save_model
 from tests.diagnosis.synthetic import NOISE_MM
 from tests.diagnosis.test_estimation import TRUTHS, bare_arm, measured_on, with_truth
@@ -206,3 +208,37 @@ def test_tables_follow_the_confidence_that_they_print():
     found = Diagnosis(Verdict("identified", ("c",), "c"), ErrorLevels(1.0, 0.1, 0.1), ranking)
     assert [row.effect for row in found.shown] == ["c", "d", "b", "a"]
     assert found.ranking == ranking
+
+
+QUIET = Round("nothing_missing", "no effect is missing; error 0.1 mm", None, (), None, 0.1, 0.1)
+ADDED = Round("identified", "creep is missing", "creep", (), 0.9, 0.2, 0.2)
+TUNED = Round(
+    "surrogate_undertrained", "a re-tuned network lowers it", "network", (), None, 0.1, 0.1
+)
+
+
+@pytest.mark.parametrize(
+    ("rounds", "left"),
+    [
+        ((ADDED, QUIET), "No effect is missing; error 0.1 mm."),
+        (
+            (ADDED, QUIET, TUNED),
+            "No effect is missing; error 0.1 mm. That was before the network was re-tuned.",
+        ),
+        ((QUIET,), "No effect is missing; error 0.1 mm."),
+        (
+            (ADDED,),
+            "No diagnosis was made after creep was added, so it is not known whether "
+            "an effect is still missing.",
+        ),
+        (
+            (ADDED, TUNED),
+            "No diagnosis was made after creep was added, so it is not known "
+            "whether an effect is still missing.",
+        ),
+    ],
+)
+def test_what_is_left_is_not_what_was_just_added(rounds, left):
+    found = Improvement(None, rounds, (), None, (None, None), 0.0, diagnoses=(said("x"),))
+    first, *_ = [part.body for part in what_is_left(found).parts if isinstance(part, Text)]
+    assert first == left

@@ -229,7 +229,7 @@ def improve_page(
     if result.parameters:
         parts.append(Section("Parameters", [parameter_table(result.parameters)]))
     if result.diagnoses:
-        parts.append(_left(result))
+        parts.append(what_is_left(result))
     parts.append(Section("How to read this", how_to_read(fall)))
     tone = "good" if result.claimed else "warn"
     return Page(title=title, verdict=result.sentence, about=about, tone=tone, parts=parts)
@@ -357,11 +357,10 @@ def _worth(result: Improvement) -> str:
     )
 
 
-def _left(result: Improvement) -> Section:
+def what_is_left(result: Improvement) -> Section:
     """What is left after the last round, and what to record next."""
     last = result.diagnoses[-1]
-    end = result.rounds[-1]
-    parts: list[Part] = [Text(f"{end.sentence[:1].upper()}{end.sentence[1:]}.")]
+    parts: list[Part] = [Text(last_word(result))]
     if last.axis:
         parts.append(Text(f"The remaining error depends most on {last.axis}."))
     wrong = [each for each in result.parameters if not each.plausible]
@@ -388,6 +387,20 @@ def _left(result: Improvement) -> Section:
     elif not last.next_experiment and not last.next_command:
         parts.append(Text("No further recording is asked for: every effect could be tested."))
     return Section("What is left, and what to record next", parts)
+
+
+def last_word(result: Improvement) -> str:
+    """What is known of the error that is left: what the last diagnosis says, if none of its effects
+    was added since."""
+    ended = [done for done in result.rounds if done.step != NETWORK][-1]
+    if ended.step is not None:
+        return (
+            f"No diagnosis was made after {ended.step} was added, so it is not known whether an "
+            "effect is still missing."
+        )
+    said = f"{ended.sentence[:1].upper()}{ended.sentence[1:]}."
+    tuned = result.rounds[-1].step == NETWORK
+    return f"{said} That was before the network was re-tuned." if tuned else said
 
 
 def _rounds(rounds: tuple[Round, ...]) -> Table:

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from surgisoft.diagnosis.amend import Amendment, Fall
+from surgisoft.diagnosis.amend import Amendment, Fall, Track
 from surgisoft.diagnosis.data_quality import LONG_ROWS, data_quality_warnings, thinning_notes
 from surgisoft.diagnosis.decision import (
     ASSET,
@@ -19,8 +19,10 @@ from surgisoft.diagnosis.decision import (
 )
 from surgisoft.diagnosis.design.schedules import SETUPS
 from surgisoft.diagnosis.diagnose import ErrorLevels, effect_left, next_command, sentence_of
+from surgisoft.diagnosis.estimation.intervals import Parameter
 from surgisoft.diagnosis.improve import Improvement
 from surgisoft.diagnosis.other_models import callable_arm, open_model, polynomial_of
+from surgisoft.diagnosis.pages.amendment import amend_page
 from surgisoft.diagnosis.weight import under_weight
 from surgisoft.errors import InputError
 from surgisoft.surrogate.callables.named import given_callable
@@ -291,3 +293,24 @@ def test_a_polynomial_needs_predictions():
     some = recording(np.zeros(60), walk(60))
     with pytest.raises(InputError, match="me: the recordings have no predicted key points; name"):
         polynomial_of([some], still_model().spec, "me")
+
+
+def test_the_page_of_an_amendment_has_the_words_of_its_sentence():
+    """Plausible ranges as the terminal prints them; each fall of the model that it belongs to."""
+    track = Track(np.arange(20.0), np.full(20, 0.5), np.full(20, 0.2), np.arange(20) == 0)
+    values = ("creep", "tau_s", 4428.0, 0.05, 5000.0, "s", False, (0.1, 2000.0), "the elements")
+    made = amendment(
+        retuned=True, held_out=fall(0.5, 0.15, ci95=(0.3, 0.4)), parameters=(Parameter(*values),),
+        tracks=(track, track),
+    )  # fmt: skip
+    facts, parameters = amend_page(made, "t", "a").parts[:2]
+    shown = dict(facts.items)
+    assert shown["after, network re-tuned"] == "0.150 mm"
+    assert shown["fall, 95 %, network re-tuned"] == "0.300 to 0.400 mm"
+    assert shown["fall, 95 %, effects alone"] == "0.100 to 0.400 mm"
+    assert shown["fall, 95 %, effects alone"][:-3] in made.sentence
+    ((*_, plausible, source),) = parameters.parts[0].rows
+    assert (plausible, source) == ("0.1 to 2000: outside", "the elements")
+    plain = dict(amend_page(replace(made, retuned=False), "t", "a").parts[0].items)
+    assert plain["fall, 95 %"] == "0.300 to 0.400 mm"
+    assert "fall, 95 %, effects alone" not in plain

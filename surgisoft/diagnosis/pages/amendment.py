@@ -54,14 +54,16 @@ POINTS = 600
 
 def amend_page(result: Amendment, title: str, about: str) -> Page:
     """The page of an amendment."""
-    fall = result.held_out
+    fall, alone = result.held_out, result.alone
+    of_model = ", network re-tuned" if result.retuned else ""
     facts = Facts(
         [
             ("before", f"{fall.before:.3f} mm"),
-            ("after", f"{fall.after:.3f} mm"),
-            ("after, effects alone", f"{result.alone.after:.3f} mm"),
+            (f"after{of_model}", f"{fall.after:.3f} mm"),
+            ("after, effects alone", f"{alone.after:.3f} mm"),
             ("noise floor", f"{fall.floor:.3f} mm"),
-            ("fall, 95 %", f"{fall.ci95[0]:.3f} .. {fall.ci95[1]:.3f} mm"),
+            (f"fall, 95 %{of_model}", _interval(fall)),
+            *([("fall, 95 %, effects alone", _interval(alone))] if result.retuned else []),
             ("held-out rows", f"{fall.rows}"),
             *_of_model(result.model_error),
             *_in_fit(fall),
@@ -89,6 +91,11 @@ def amend_page(result: Amendment, title: str, about: str) -> Page:
             Section("How to read this", how_to_read(fall)),
         ],
     )
+
+
+def _interval(fall: Fall) -> str:
+    """The interval of a fall as the sentence of the result has it."""
+    return f"{fall.ci95[0]:.3f} to {fall.ci95[1]:.3f} mm"
 
 
 def how_to_read(fall: Fall) -> list[Part]:
@@ -127,7 +134,7 @@ def parameter_table(parameters: tuple[Parameter, ...]) -> Table:
             values_text(each.value),
             each.interval_text or "-",
             each.unit or "-",
-            "{:.3g} .. {:.3g}".format(*each.plausible_range)
+            " to ".join(map(values_text, each.plausible_range))
             + ("" if each.plausible else ": outside"),
             each.source,
         )
@@ -196,7 +203,7 @@ def improve_page(
             ("before", f"{fall.before:.3f} mm"),
             ("after", f"{fall.after:.3f} mm"),
             ("noise floor", f"{fall.floor:.3f} mm"),
-            ("fall, 95 %", f"{fall.ci95[0]:.3f} .. {fall.ci95[1]:.3f} mm"),
+            ("fall, 95 %", _interval(fall)),
             ("steps", f"{len(result.steps)}"),
             *_of_model(result.model_error),
             *_in_fit(fall),

@@ -44,7 +44,10 @@ def test_five_steps_with_their_pictures(tmp_path, monkeypatch, capsys):
     for name in ("cut.rrd", "compare/report.html", "diagnosis.html", "amendment.html"):
         assert (folder / name).stat().st_size > 10_000
     # pictures: dose and paths of the cut, bodies, loops and error, ranking, the fall
-    assert page.count("<img") >= 9
+    assert page.count("<img") >= 10
+    measured = page.rpartition("2. A robot is measured")[2].partition("<section")[0]
+    assert measured.count("<img") == 1, "what was recorded, over time"
+    assert "how far the tip moved" in measured
     assert base64.b64encode(shown[0]).decode() in page
     # a second call keeps the first one's files
     assert run(["demo", "-o", str(folder)]) == 2

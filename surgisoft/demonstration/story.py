@@ -10,7 +10,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from surgisoft.agents.report import episode_parts
@@ -23,13 +23,15 @@ from surgisoft.diagnosis.pages.compare import write_report
 from surgisoft.diagnosis.pages.diagnosis import diagnosis_page
 from surgisoft.diagnosis.residuals import residual_table
 from surgisoft.errors import InputError
-from surgisoft.measurement.recordings import load_recordings
+from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.progress import Progress, Stages, silent
 from surgisoft.replay.episode_view import write_replay
 from surgisoft.replay.model_error import write_compared, write_models
 from surgisoft.replay.show import open_replay
 from surgisoft.report import Command, Page, Part, Picture, Section, Text, write_page
+from surgisoft.report.charts import AMBER, BLUE, GREEN, chart, drawing, plt
 from surgisoft.surrogate.checkpoint import save_model
+from surgisoft.time_axis import continued, with_gaps
 from surgisoft.workers import ONE_THREAD, torch_threads
 
 FOLDER = "surgisoft_demo"
@@ -138,7 +140,7 @@ def _five_steps(
     story.tell(
         " ".join(_collect_arguments(RECORDING)),
         f"a robot with hidden {HIDDEN} was recorded for {POINTS // 20} s",
-        MEASURED,
+        _measured_parts(load_recordings(folder / RECORDING)[0]),
     )
 
     stages.stage(10, "step 3 of 5: the model is compared with it")
@@ -289,14 +291,36 @@ def _cut_parts(log, picture: Path | None) -> list[Part]:
     return [*parts, *episode_parts(log)[:-1]]
 
 
-MEASURED = (
-    Text(
-        "The virtual rig simulates a robot that creeps: its wall yields slowly under load. The "
-        "model does not contain creep. On a bench of your own the recording comes from "
-        "`surgisoft import` or from a rig driver."
-    ),
-)
-"""What step 2 shows."""
+def _measured_parts(recording: Recording) -> list[Part]:
+    """What step 2 shows: actuation and tip over time."""
+    return [
+        Text(
+            "The virtual rig simulates a robot that creeps: its wall yields slowly under load. The "
+            "model does not contain creep. On a bench of your own the recording comes from "
+            "`surgisoft import` or from a rig driver."
+        ),
+        _recording_chart(recording),
+    ]
+
+
+def _recording_chart(recording: Recording) -> Picture:
+    """Pressures and position of the tip over time; the runs stand one after another."""
+    time_s, tip = continued(recording.t_s), recording.key_points_mm[:, -1]
+    with drawing():
+        figure, (top, below) = plt.subplots(2, 1, figsize=(7.2, 3.4), sharex=True)
+        columns = [
+            (top, recording.measured, [f"chamber {i + 1}" for i in range(3)]),
+            (below, tip - tip[0], ["x", "y", "z"]),
+        ]
+        for axis, values, labels in columns:
+            for column, colour, label in zip(values.T, (BLUE, AMBER, GREEN), labels, strict=True):
+                axis.plot(*with_gaps(time_s, column), c=colour, lw=0.8, label=label)
+            axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+        top.set_ylabel(f"pressure [{recording.unit}]")
+        below.set_ylabel("tip [mm]")
+        below.set_xlabel("time [s]")
+        what = "The recording: pressures, and how far the tip moved from where it began"
+        return replace(chart(figure, what, what), least_px=BROAD_PX)
 
 
 def _amended_parts(amendment: Amendment | None) -> list[Part]:

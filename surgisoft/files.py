@@ -31,7 +31,7 @@ def noted_writes() -> Iterator[list[Path]]:
     """Files and folders that are written inside the block, in order, each added when complete.
 
     Those in a folder that is being filled are listed under its temporary name, which is gone
-    later. Work in other threads and processes is not noted.
+    later. Work in other threads and processes is not noted, except by `note_written`.
     """
     written: list[Path] = []
     token = _noted.set(written)
@@ -41,7 +41,8 @@ def noted_writes() -> Iterator[list[Path]]:
         _noted.reset(token)
 
 
-def _note(path: Path) -> None:
+def note_written(path: Path) -> None:
+    """Add a file or folder, which is complete, to those of `noted_writes`."""
     written = _noted.get()
     if written is not None:
         written.append(path)
@@ -61,7 +62,7 @@ def new_file(path: str | Path, noted: bool = True) -> Iterator[Path]:
         yield fresh
         os.replace(fresh, path)
         if noted:
-            _note(path)
+            note_written(path)
     finally:
         fresh.unlink(missing_ok=True)
 
@@ -81,7 +82,7 @@ def new_folder(folder: str | Path, own: Sequence[str] = ()) -> Iterator[Path]:
         yield fresh
         if not folder.exists():
             os.replace(fresh, folder)
-            _note(given)
+            note_written(given)
             return
         for kept in folder.iterdir():
             if kept.name not in own and not (fresh / kept.name).exists():
@@ -90,7 +91,7 @@ def new_folder(folder: str | Path, own: Sequence[str] = ()) -> Iterator[Path]:
         old = _beside(folder)
         os.replace(folder, old)
         os.replace(fresh, folder)
-        _note(given)
+        note_written(given)
         shutil.rmtree(old)
     finally:
         shutil.rmtree(fresh, ignore_errors=True)

@@ -1,6 +1,7 @@
 """The demonstration: five steps, each with its result on the page and its files."""
 
 import base64
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -9,6 +10,7 @@ from PIL import Image
 from surgisoft.cli import run
 from surgisoft.demonstration import story
 from surgisoft.errors import InputError
+from surgisoft.files import write_atomically
 from surgisoft.measurement.recordings import load_recordings
 from surgisoft.report import Text
 from surgisoft.surrogate.checkpoint import load_model
@@ -86,5 +88,39 @@ def test_what_ends_early_leaves_whole_steps_or_nothing(tmp_path, monkeypatch, fa
     assert [path.name for path in folder.iterdir()] == ["index.html"]
     page = (folder / "index.html").read_text()
     assert page.count("<section") == 1
-    assert "4 more steps follow" in page
+    assert "ended before the next step (4 of 5 are left)" in page
     assert "the cut" in page
+
+
+def test_ctrl_c_names_what_is_complete_and_leaves_its_page(tmp_path, monkeypatch, capsys):
+    """Interrupted at the picture of the cut, while the other process has recorded the robot."""
+    folder, parts = tmp_path / "story", [Text("the cut"), Text("left out")]
+    cut = SimpleNamespace(logs={"ring": object()})
+
+    def interrupted(*_, **__):
+        until = time.monotonic() + 300.0
+        while not (folder / "bench.toml").exists() and time.monotonic() < until:
+            time.sleep(0.05)
+        raise KeyboardInterrupt
+
+    def replay(log, path):
+        write_atomically(path, b"the replay")
+
+    monkeypatch.setattr(story, "POINTS", 200)
+    monkeypatch.setattr(story, "evaluate", lambda *_, **__: cut)
+    monkeypatch.setattr(story, "cut_sentence", lambda cut: "the whole ring was cut")
+    monkeypatch.setattr(story, "episode_parts", lambda log: parts)
+    monkeypatch.setattr(story, "write_replay", replay)
+    monkeypatch.setattr(story, "open_replay", interrupted)
+    assert run(["demo", "-o", str(folder)]) == 130
+    said = capsys.readouterr()
+    assert "1. cut: the whole ring was cut" in said.out
+    files = {path.name for path in folder.iterdir()}
+    assert files == {"cut.rrd", "index.html", "bench.parquet", "bench.toml"}
+    last = said.err.splitlines()[-1]
+    assert all(str(folder / name) in last for name in files)
+    assert last.endswith("; nothing else")
+    assert len(load_recordings(folder / "bench.parquet")[0].t_s) == 200
+    page = (folder / "index.html").read_text()
+    assert page.count("<section") == 1
+    assert "ended before the next step (4 of 5 are left)" in page

@@ -75,7 +75,7 @@ OLD_NAMES = {
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
-NAMED_FILES = 4
+NAMED_FILES = 8
 """Most files that the message after Ctrl-C names (a count)."""
 NEW_OBJECTS = 10_000
 """New containers after which Python looks for cycles among them (a count; its own default is 700).

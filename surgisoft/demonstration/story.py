@@ -23,6 +23,7 @@ from surgisoft.diagnosis.pages.compare import write_report
 from surgisoft.diagnosis.pages.diagnosis import diagnosis_page
 from surgisoft.diagnosis.residuals import residual_table
 from surgisoft.errors import InputError
+from surgisoft.files import note_written
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.progress import Progress, Stages, silent
 from surgisoft.replay.episode_view import write_replay
@@ -116,6 +117,17 @@ def _five_steps(
     recorded: waits for the recording, which is made meanwhile.
     """
     story = _Story(folder / "index.html", on_step)
+    try:
+        return _told(story, folder, policy, progress, recorded)
+    except BaseException:
+        story.end_early()
+        raise
+
+
+def _told(
+    story: "_Story", folder: Path, policy: str | Path, progress: Progress, recorded
+) -> Demonstration:
+    """Run the five steps, each told when it is done."""
     stages = Stages(progress, 100)
     cutting = stages.stage(25, "step 1 of 5: two arms cut a ring")
     cut = evaluate(
@@ -127,13 +139,15 @@ def _five_steps(
     )
     log = cut.logs[str(policy)]
     write_replay(log, folder / "cut.rrd")
-    stages.stage(15, "step 1 of 5: picture of the replay")
-    picture, no_picture = _replay_picture(folder / "cut.rrd", folder / "cut.png")
     story.tell(
         f"evaluate {policy} --episodes 1 --replay cut.rrd",
         cut_sentence(cut),
-        _cut_parts(log, picture),
+        _cut_parts(log, None),
     )
+    stages.stage(15, "step 1 of 5: picture of the replay")
+    picture, no_picture = _replay_picture(folder / "cut.rrd", folder / "cut.png")
+    if picture is not None:
+        story.show_more(_cut_parts(log, picture))
 
     stages.stage(20, "step 2 of 5: a robot is recorded")
     recorded()
@@ -189,7 +203,7 @@ def _recorder(file: Path) -> Iterator[Callable[[], None]]:
     """Record the robot in a process of its own; yields a function that waits for the recording.
 
     A first run compiles the rig for half a minute, while this process compiles the scene. Leaving
-    the block ends the process.
+    the block ends the process; what it wrote is noted (`surgisoft.files.noted_writes`).
     """
     command = [sys.executable, "-m", "surgisoft", *_collect_arguments(str(file))]
     quiet = subprocess.DEVNULL
@@ -214,6 +228,9 @@ def _recorder(file: Path) -> Iterator[Callable[[], None]]:
         if child.poll() is None:
             child.terminate()
             child.communicate()
+        for written in (file, file.with_suffix(".toml")):
+            if written.exists():  # each is written whole, or not at all
+                note_written(written)
 
 
 def _collect_arguments(file: str) -> list[str]:
@@ -241,6 +258,13 @@ def _replay_picture(replay: Path, file: Path) -> tuple[Path | None, str]:
     return file, ""
 
 
+RELOAD = "reload this page to see the results so far."
+MORE = ("", f" One more step follows; {RELOAD}", f" {{}} more steps follow; {RELOAD}")
+"""What the page says of the steps that are left: of none, of one, of more."""
+ENDED_EARLY = " The demonstration was ended before the next step ({} of 5 are left)."
+"""What it says where none will follow."""
+
+
 @dataclass
 class _Story:
     """The page of the demonstration, which grows by a section with each step."""
@@ -253,6 +277,10 @@ class _Story:
     """Result of each step so far, by its name."""
     sections: list[Section] = field(default_factory=list)
     """Sections of the page so far."""
+    begin: list[Part] = field(default_factory=list)
+    """What the last section begins with: command and result."""
+    tone: str = "plain"
+    """Colour of the page's verdict."""
 
     def tell(self, command: str, sentence: str, parts: Sequence[Part], tone: str = "plain") -> None:
         """Add the next step, and write the page.
@@ -261,18 +289,34 @@ class _Story:
         """
         name, title = STEPS[len(self.sections)]
         said = f"{sentence[:1].upper()}{sentence[1:]}."
-        number = len(self.sections) + 1
-        told = [Command(f"surgisoft {command}")] if command else []
-        self.sections.append(Section(f"{number}. {title}", [*told, Text(said), *parts]))
+        told: list[Part] = [Command(f"surgisoft {command}")] if command else []
+        self.begin, self.tone = [*told, Text(said)], tone
+        self.sections.append(Section(f"{len(self.sections) + 1}. {title}", [*self.begin, *parts]))
         self.sentences[name] = sentence
-        left = len(STEPS) - number
-        verdict = said
-        if left:
-            steps = "One more step follows" if left == 1 else f"{left} more steps follow"
-            verdict = f"{said} {steps}; reload this page to see the results so far."
-        page = Page("surgisoft in five steps", verdict, self.sections, "surgisoft demo", tone)
-        write_page(page, self.page)
+        self._write(MORE[min(self._left, 2)])
         self.on_step(name, sentence)
+
+    def show_more(self, parts: Sequence[Part]) -> None:
+        """Show other parts in the last section, and write the page."""
+        self.sections[-1] = Section(self.sections[-1].title, [*self.begin, *parts])
+        self._write(MORE[min(self._left, 2)])
+
+    def end_early(self) -> None:
+        """Say on the page that no further step follows; without a step there is no page."""
+        if self.sections and self._left:
+            with contextlib.suppress(OSError):  # what ended it is told, not this
+                self._write(ENDED_EARLY)
+
+    @property
+    def _left(self) -> int:
+        return len(STEPS) - len(self.sections)
+
+    def _write(self, following: str) -> None:
+        """Write the page; following: what its verdict says of the steps that are left."""
+        said = list(self.sentences.values())[-1]
+        verdict = f"{said[:1].upper()}{said[1:]}.{following.format(self._left)}"
+        page = Page("surgisoft in five steps", verdict, self.sections, "surgisoft demo", self.tone)
+        write_page(page, self.page)
 
 
 def _cut_parts(log, picture: Path | None) -> list[Part]:

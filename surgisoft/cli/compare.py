@@ -155,12 +155,14 @@ def compare(
     if context:
         print(f"credibility: {assessed.sentence}")
     show_written(written)
-    if result.explainable:
+    best = min(range(len(compared)), key=lambda i: compared[i].result.rmse_mm)
+    if compared[best].result.explainable:
         names = " ".join(map(str, recordings))
         since = f" --before {' '.join(map(str, before))}" if before else ""
         since += model_options(predictions, model_error)
-        following = with_effect_files(f"surgisoft diagnose {model} {names}{since}")
-        print(f"next, which effect is missing: {following}")
+        following = with_effect_files(f"surgisoft diagnose {models[best]} {names}{since}")
+        closest = " from the model of the smallest error" if others else ""
+        print(f"next, which effect is missing{closest}: {following}")
 
 
 def _values(compared) -> dict:

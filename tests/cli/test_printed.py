@@ -12,6 +12,7 @@ from surgisoft.cli import run
 from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Ranked, Verdict
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import Recording, save_recording
+from surgisoft.surrogate.checkpoint import load_model, save_model
 
 NAN = float("nan")
 
@@ -89,6 +90,23 @@ def test_compare_prints_what_is_known_and_says_what_is_not(bench, capsys, monkey
     assert re.search(r"other +0\.5000 +0\.4000 \.\. 0\.6000 +0\.7500 +25 %\n", out)
     assert re.search(r"default +0\.5000 .* -\n", out)
     assert "which effect is missing" not in out
+
+
+@pytest.mark.parametrize(("errors", "named"), [((0.5, 0.1), "new"), ((0.1, 0.5), "default")])
+def test_compare_advises_to_diagnose_the_closest_of_several_models(
+    errors, named, bench, tmp_path, capsys, monkeypatch
+):
+    """A model that was amended leaves the old one behind: what it lacks is known by then."""
+    rec, new = str(bench / "bench.parquet"), tmp_path / "new"
+    save_model(load_model("default"), new)
+    two = [
+        comparison(name, rmse_mm=error, explainable=0.5)
+        for name, error in zip(("default", "new"), errors, strict=True)
+    ]
+    target = "surgisoft.diagnosis.compare.compare_all"
+    out = printed(capsys, monkeypatch, target, two, "compare", "default", str(new), rec)
+    path = {"default": "default", "new": new}[named]
+    assert out.endswith(f"from the model of the smallest error: surgisoft diagnose {path} {rec}\n")
 
 
 def summary(mean: float, episodes: int = 3) -> SimpleNamespace:

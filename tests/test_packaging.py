@@ -16,6 +16,7 @@ WANTED = {
 } | {
     "surgisoft/assets/default_arm/weights.safetensors",
     "surgisoft/assets/default_arm/config.json",
+    "surgisoft/assets/default_arm/MODEL_CARD.md",
     "surgisoft/assets/policies/ring/config.json",
     "surgisoft/assets/policies/ring/checkpoints/best.pt",
     "surgisoft/assets/policies/ring/arms/laser/weights.safetensors",

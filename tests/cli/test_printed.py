@@ -487,7 +487,7 @@ def test_a_missing_library_is_named_with_its_extra(capsys, monkeypatch):
 
         monkeypatch.setattr("surgisoft.replay.show.open_replay", raised)
 
-    missing("rerun_cli.node")
+    missing("rerun_cli")
     assert run(["replay", "a.npz"]) == 2
     said = capsys.readouterr().err
     assert "'rerun_cli' is missing; install it with: pip install 'surgisoft[replay]'" in said

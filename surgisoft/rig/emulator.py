@@ -5,7 +5,8 @@ It speaks the real protocols over real transports of this computer; a simulated 
     python -m surgisoft.rig.emulator --rig virtual:seed=0
 
 prints the options that open it as a rig (`--rig serial:port=/dev/pts/3,mocap=udp:9763`). Nothing
-but pseudo-terminals and the loopback interface is used.
+but pseudo-terminals and the loopback interface is used. The simulated rig stands still until a
+client first sets pressures, so that the time of a change (`hidden=payload@60`) counts from there.
 """
 
 from __future__ import annotations
@@ -113,6 +114,8 @@ class Emulator:
         tty.setraw(self._end)
         self.port = os.ttyname(self._end)
         self._cut = False
+        self._driven = False
+        """A client has set pressures: the simulated rig's time runs."""
         self._over = threading.Event()
         self.rig.reset()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -147,6 +150,7 @@ class Emulator:
 
     def _run(self) -> None:
         begun, step, pending = time.monotonic(), 0, b""
+        sample = self.rig.read()
         while not self._over.is_set():
             step += 1
             due = begun + step * self.rig.period_s / self.speed
@@ -156,8 +160,9 @@ class Emulator:
             now_s = step * self.rig.period_s
             self._watch(now_s)
             low, high = self.rig.limits.T
-            self.rig.command(np.clip(self._target, low, high))
-            sample = self.rig.read()
+            if self._driven:
+                self.rig.command(np.clip(self._target, low, high))
+                sample = self.rig.read()
             self._report(now_s, sample)
             self._show(now_s, sample)
             if time.monotonic() > due + 1.0:  # the computer was busy: time goes on from here
@@ -215,7 +220,7 @@ class Emulator:
         elif self.state == "T":
             self._send(f"NAK {seq} tripped")
         else:
-            self._seq, self._heard_ms = seq, -1.0
+            self._seq, self._heard_ms, self._driven = seq, -1.0, True
             self._change("R", np.clip(values, self.info.low_kPa, self.info.high_kPa))
 
     def _change(self, state: str, target: np.ndarray) -> None:

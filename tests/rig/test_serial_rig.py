@@ -68,6 +68,22 @@ def test_samples_are_those_of_the_rig_behind_the_devices(version):
     assert np.median(np.diff(times)) == pytest.approx(0.05, abs=1e-6)
 
 
+def test_a_change_counts_from_the_first_pressures_and_not_from_the_start_of_the_emulator():
+    """A mass is hung on after 3 s; the first pressures are set after 20 s of the bench's time."""
+    with emulated("virtual:seed=0,noise=0,hidden=payload:2@3", speed=10.0) as bench:
+        while bench.number < 200:
+            time.sleep(0.01)
+        assert bench.rig.time_s < 31.0, "the reset and nothing more"
+        with guarded(open_rig(f"{bench.options},rest_s=0.2")) as rig:
+            rig.wait(10.0)
+            samples = drive(rig, [0.0, 0.0, 0.0], 120)
+    at = np.array([s.t_s for s in samples]) - samples[0].t_s
+    tips = np.array([s.key_points_mm[-1] for s in samples])
+    off = np.linalg.norm(tips - tips[at < 1.0].mean(0), axis=1)
+    assert off[at < 1.0].max() < 0.01, "as it was"
+    assert off[at > 4.5].min() > 0.3, "the mass hangs on it"
+
+
 def test_multicast_on_the_loopback_interface():
     options = {"speed": 10.0, "natnet_version": (4, 1), "multicast": "239.255.42.98"}
     with (

@@ -4,6 +4,7 @@ A target makes samples, folders with the files that one call reads; `mutable` na
 sample that are mutated. A new reader is fuzzed by its line in `TARGETS`.
 """
 
+import dataclasses
 import gzip
 import shutil
 from collections.abc import Callable
@@ -231,7 +232,7 @@ def _model(**fields):
 
 
 def make_models(folder: Path) -> None:
-    """Models of the fit: pressure only, with hysteresis, and a recurrent network."""
+    """Models of the fit: every kind of network, with hysteresis, and one with all effects."""
     from surgisoft.surrogate.checkpoint import save_model
 
     for name, fields in {
@@ -239,8 +240,26 @@ def make_models(folder: Path) -> None:
         "hysteresis": {"effects": ["hysteresis"]},
         "recurrent": {"network": "recurrent"},
         "curvature": {"network": "constant_curvature"},
+        "kernel": {"network": "kernel"},
+        "arcs": {"prior": "arcs"},
+        "ensemble": {"members": 3},
     }.items():
         save_model(_model(**fields), folder / name)
+    save_model(with_all_effects(_model()), folder / "effects")
+
+
+def with_all_effects(model):
+    """The model with every effect of the package, each of which does something."""
+    from surgisoft.surrogate.effects import EFFECTS, make_effect
+    from surgisoft.surrogate.model import arm_facts
+
+    spec = dataclasses.replace(model.spec, gravity=(0.0, 0.0, 1.0), length_mm=70.0)
+    facts, effects = arm_facts(spec, model.rest_mm), {}
+    for name in EFFECTS:
+        effects[name] = make_effect(name, facts).requires_grad_(False)
+        for amplitude in effects[name].amplitudes().values():
+            amplitude.fill_(0.01)
+    return model.replace(spec=spec, effects=effects)
 
 
 def read_model(sample: Path) -> None:
@@ -292,8 +311,26 @@ def read_resumed(sample: Path) -> None:
     reopened(sample, Processes(), torch.device("cpu"))
 
 
+EPISODES = (
+    "circle_ablation",
+    "track_circle",
+    "keyhole",
+    "contour_ablation",
+    "area_ablation",
+    "breathing_ablation",
+    "two_laser_ring",
+)
+"""Tasks of the sampled episodes: with one, two and three arms, one and two beams, without a body,
+with a plate and an organ, at rest and breathing, with one path, several paths and an area."""
+
+
 def make_episodes(folder: Path) -> None:
-    """Logs of a cut and of a circle, scripted."""
+    """Logs of `EPISODES`, scripted."""
+    for name in EPISODES:
+        _make_episode(folder, name)
+
+
+def _make_episode(folder: Path, name: str) -> None:
     import torch
 
     from surgisoft.tasks.base import Episodes
@@ -301,32 +338,29 @@ def make_episodes(folder: Path) -> None:
     from surgisoft.tasks.episodes.log import EpisodeRecorder
     from surgisoft.tasks.registry import make_task
 
-    for name in ("circle_ablation", "track_circle"):
-        task = make_task(name)
-        with torch.inference_mode():
-            episodes = Episodes(task, donate=True)
-            state = episodes.seeded(4, 1)
-            recorder = EpisodeRecorder(task, state, policy="scripted", seed=4)
-            for _ in range(12):
-                actions = task.script(state)
-                state, outcome = episodes.step(state, actions)
-                recorder.step(state, outcome, actions)
-        log = recorder.log()
-        save_episode(_smaller(log), folder / name / "episode.npz")
+    task = make_task(name)
+    with torch.inference_mode():
+        episodes = Episodes(task, donate=True)
+        state = episodes.seeded(4, 1)
+        recorder = EpisodeRecorder(task, state, policy="scripted", seed=4)
+        for _ in range(12):
+            actions = task.script(state)
+            state, outcome = episodes.step(state, actions)
+            recorder.step(state, outcome, actions)
+    save_episode(_smaller(recorder.log()), folder / name / "episode.npz")
 
 
 def _smaller(log):
     """The log with the organ alone, for small files."""
-    from dataclasses import replace
-
     if log.dose is None:
         return log
     (organ,) = (body for body in log.bodies if body.name == log.dose.body)
     kept, own = np.unique(log.dose.faces, return_inverse=True)
     used, faces = np.unique(organ.faces[kept], return_inverse=True)
     faces = faces.reshape(-1, 3).astype(np.int32)
-    organ = replace(organ, vertices_mm=organ.vertices_mm[used], faces=faces)
-    return replace(log, bodies=(organ,), dose=replace(log.dose, faces=own.astype(np.int32)))
+    organ = dataclasses.replace(organ, vertices_mm=organ.vertices_mm[used], faces=faces)
+    dose = dataclasses.replace(log.dose, faces=own.astype(np.int32))
+    return dataclasses.replace(log, bodies=(organ,), dose=dose)
 
 
 def read_episode(sample: Path) -> None:
@@ -358,8 +392,7 @@ def read_replay(sample: Path) -> None:
 
 def make_replays(folder: Path) -> None:
     """A Rerun recording of a circle."""
-    make_episodes(folder)
-    shutil.rmtree(folder / "circle_ablation")
+    _make_episode(folder, "track_circle")
     from surgisoft.replay.episode_view import write_replay
     from surgisoft.tasks.episodes.file import load_episode
 

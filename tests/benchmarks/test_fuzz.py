@@ -8,11 +8,14 @@ import time
 
 import numpy as np
 import pytest
+import torch
 
 from benchmarks.fuzz import targets
 from benchmarks.fuzz.mutations import KINDS, change_tree, mutated
 from benchmarks.fuzz.run import Batch, Inputs, Limits, examine, make_corpus, turns_of
 from surgisoft.errors import InputError
+from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
+from surgisoft.surrogate.effects import EFFECTS
 
 
 def raising(error):
@@ -113,3 +116,16 @@ def test_a_mutation_that_cannot_be_made_is_one_of_bytes():
 def test_targets_take_turns_by_weight():
     turns = turns_of(["recording", "scene"])
     assert [next(turns) for _ in range(8)].count("recording") == 6
+
+
+def test_the_sample_with_all_effects_bends_otherwise_and_is_read(tmp_path):
+    plain = default_arm().replace(effects={})
+    effects = targets.with_all_effects(plain)
+    assert set(effects.effects) == set(EFFECTS)
+    save_model(effects, tmp_path)
+    targets.read_model(tmp_path)
+    ends = []
+    for model in (plain, load_model(tmp_path)):
+        with torch.inference_mode():
+            ends.append(model.step(model.initial_state(batch=1), torch.ones(1, 3), dt=0.05)[1])
+    assert (ends[0] - ends[1]).abs().max() > 0.01

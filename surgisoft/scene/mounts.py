@@ -459,8 +459,10 @@ def _evaluate_tip(engine, name: str, arm: MountedArm, ring: Ring, limits: Limits
     return TipSite(arm, touch, least, good, float(score))
 
 
-COMBINED = {"laser": 12, "endoscope": 40, "tip": 12}
-"""Number of the best mounts of each of two arms that are combined, by tool."""
+COMBINED = {"laser": 12, "endoscope": 40, "tip": 40}
+"""Number of the best mounts of each of two arms that are combined, by tool. Of a tip's mounts the
+best touch the lesion almost at rest, in the way of a second tip: with 12 of each no two tips were
+found on an ellipsoid of 120 x 100 x 70 mm."""
 COMBINED_OF_MANY = 40
 """Number of the best mounts of each arm that are combined where a scene has more than two: with 12
 of each laser, no combination of two lasers, endoscope and tip was found on a ball of 60 mm."""
@@ -564,10 +566,12 @@ def find_mounts(
     if not arrangements:
         who = "two of them" if len(mounts) == 2 else "combination of them"
         room = "both arms" if len(mounts) == 2 else "all arms"
+        beside = [f"{100 * limits.view_fraction:.0f} % of the ring in view"] if looks else []
+        if lasers:
+            beside.append("a free way for each beam")
         sentence = (
             f"each arm finds a mount, but no {who} leave{'s' * (len(mounts) > 2)} room for {room} "
-            f"({limits.clearance_mm:g} mm apart) with {100 * limits.view_fraction:.0f} % of the "
-            "ring in view"
+            f"({limits.clearance_mm:g} mm apart)" + " with " * bool(beside) + " and ".join(beside)
         )
         return [], Shortfall(sentence, covered, viewed)
     return arrangements, None
@@ -629,6 +633,8 @@ def _together(
     found = []
     for score, chosen in partial:
         arranged = {name: sites[name][k] for name, k in chosen}
+        if not beams_land(engine, arranged, moments, ring):
+            continue
         least = least_view(engine, arranged, moments, ring, camera)
         if least >= limits.view_fraction:
             found.append(Arrangement(arranged, least, score))
@@ -643,7 +649,9 @@ def _pair_score(one, other, moments: dict[str, np.ndarray], limits: LimitsSpec) 
         (one, other), key=lambda arm: MOVES.index(arm[1])
     )
     radii = first.arm.reach.radius_mm + second.arm.reach.radius_mm
-    work = np.concatenate((second.way_mm, second.work_mm))
+    work = second.way_mm
+    if second_tool != "tip":  # a tip at work is at rest, where its way begins
+        work = np.concatenate((work, second.work_mm))
     steps = [first.way_mm, work]
     if first_tool == second_tool == "laser":
         rings = first.work_mm[moments[a]], second.work_mm[moments[b]]
@@ -687,13 +695,8 @@ def least_view(
     camera: CameraSpec,
 ) -> float:
     """Smallest fraction of the ring in an endoscope's view while the lasers go round; 1 without."""
+    lines = _lines_at_work(sites, moments, ring)
     count = len(ring.points_mm) if moments else 1
-    lines = {
-        name: site.work_mm[moments[name]]
-        if name in moments
-        else np.tile(site.stays_mm, (count, 1, 1))
-        for name, site in sites.items()
-    }
     least = 1.0
     for name, site in sites.items():
         if not isinstance(site, EndoscopeSite):
@@ -703,6 +706,44 @@ def least_view(
         seen = view(engine, camera.camera(), poses, ring.points_mm, ring.normals, others)
         least = min(least, float(seen.fraction.min()))
     return least
+
+
+def beams_land(
+    engine: BatchedScene, sites: dict[str, Site], moments: dict[str, np.ndarray], ring: Ring
+) -> bool:
+    """Whether each laser's beam ends at its point of the ring while the other arms are at work."""
+    lines = {
+        name: torch.from_numpy(np.ascontiguousarray(line))
+        for name, line in _lines_at_work(sites, moments, ring).items()
+    }
+    for name, order in moments.items():
+        site = sites[name]
+        assert isinstance(site, LaserSite), "only lasers go round the ring"
+        standoff = site.cut.standoff_mm[order]
+        hit = engine.cast(
+            lines[name][:, -1],
+            torch.from_numpy(site.cut.directions[order]),
+            float(standoff.max()) + 50.0,
+            lines,
+            own=name,
+        )
+        away = np.abs(hit.distance_mm.numpy() - standoff)
+        if not (hit.on_organ.numpy() & (away <= LANDED_MM)).all():
+            return False
+    return True
+
+
+def _lines_at_work(
+    sites: dict[str, Site], moments: dict[str, np.ndarray], ring: Ring
+) -> dict[str, np.ndarray]:
+    """Each arm's centrelines (M, K, 3) mm while the lasers go round; M is 1 without a laser."""
+    count = len(ring.points_mm) if moments else 1
+    return {
+        name: site.work_mm[moments[name]]
+        if name in moments
+        else np.tile(site.stays_mm, (count, 1, 1))
+        for name, site in sites.items()
+    }
 
 
 def _laser_shortfall(best: LaserSite, laser: LaserSpec, limits: LimitsSpec) -> str:

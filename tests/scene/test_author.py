@@ -11,6 +11,7 @@ import trimesh
 
 from surgisoft.cli import run
 from surgisoft.errors import InputError
+from surgisoft.scene import mounts
 from surgisoft.scene.author import (
     UP,
     Request,
@@ -21,7 +22,13 @@ from surgisoft.scene.author import (
     write_scene,
 )
 from surgisoft.scene.capsules import ArmShape
-from surgisoft.scene.check import REASONS, check_scene, mounted_arms, reach_patch, sentence
+from surgisoft.scene.check import (
+    REASONS,
+    check_scene,
+    mounted_arms,
+    reach_patch,
+    sentence,
+)
 from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.folder import open_scene
 from surgisoft.scene.mesh import Mesh
@@ -300,6 +307,42 @@ def test_a_lesion_on_the_side_is_reached_where_the_lid_leaves_room(tmp_path, cap
     scene = open_scene(tmp_path / "scene")
     assert scene.spec.body("lid").role == "support"
     np.testing.assert_allclose(scene.spec.lesion.centre_mm, [56.9, 0.0, -19.0], atol=0.6)
+
+
+def ellipsoid(folder):
+    """An organ of 120 x 100 x 70 mm."""
+    sphere = ball(1.0, 3)
+    write_ply(Mesh(sphere.vertices_mm * (60.0, 50.0, 35.0), sphere.faces), folder / "organ.ply")
+    return folder / "organ.ply"
+
+
+@pytest.mark.parametrize("arms", ["laser,tip", "tip,tip"])
+def test_a_tip_finds_a_place_beside_one_other_arm(arms, tmp_path):
+    assert new(tmp_path / "scene", ellipsoid(tmp_path), "--unit", "mm", "--arms", arms) == 0
+    scene = open_scene(tmp_path / "scene")
+    reaches = reaches_of(scene)
+    verdict = check_scene(scene, reaches)  # by FCL; the search uses the batched engine
+    assert verdict.good
+    assert all(touch.reached for touch in verdict.work.touches.values())
+    checker = CollisionChecker(scene.bodies)
+    placed, radius = mounted_arms(scene, reaches), {k: r.radius_mm for k, r in reaches.items()}
+    ways = {name: touch.way_mm for name, touch in verdict.work.touches.items()}
+    for name, cut in verdict.work.cuts.items():
+        ways[name] = placed[name].lines(placed[name].approach(cut.centre))[0]
+    stands = {name: ArmShape(way[0], radius[name]) for name, way in ways.items()}
+    for name, way in ways.items():  # one after another; the others are at rest
+        for line in way[:: max(1, len(way) // 8)]:
+            shapes = stands | {name: ArmShape(line, radius[name])}
+            assert checker.clearance(shapes).least_mm >= scene.spec.limits.clearance_mm
+
+
+def test_two_tips_without_room_are_told_without_a_view(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("surgisoft.scene.mounts.COMBINED", dict.fromkeys(mounts.COMBINED, 1))
+    organ = ellipsoid(tmp_path)
+    assert new(tmp_path / "scene", organ, "--unit", "mm", "--arms", "tip,tip") == 1
+    said = capsys.readouterr().out.splitlines()[-1]
+    assert "no two of them leave room for both arms (1 mm apart)." in said
+    assert "view" not in said
 
 
 BAD = [

@@ -464,7 +464,8 @@ def author(
             if check.good:
                 chosen = _chosen(scene, check, site, prepared)
                 return Authored(scene, check, (*prepared.notes, *chosen))
-            failures.append((check.work.covered if check.work else 0.0, sentence(check)))
+            why = sentence(check).removesuffix(".")
+            failures.append((check.work.covered if check.work else 0.0, why))
         if shortfall is not None:
             failures.append((shortfall.covered, shortfall.sentence))
     best = max(failures, key=lambda failure: failure[0])[1]

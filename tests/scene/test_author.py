@@ -24,6 +24,8 @@ from surgisoft.scene.author import (
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.check import (
     REASONS,
+    Finding,
+    SceneCheck,
     check_scene,
     mounted_arms,
     reach_patch,
@@ -343,6 +345,16 @@ def test_two_tips_without_room_are_told_without_a_view(tmp_path, capsys, monkeyp
     said = capsys.readouterr().out.splitlines()[-1]
     assert "no two of them leave room for both arms (1 mm apart)." in said
     assert "view" not in said
+
+
+def test_the_reason_ends_with_one_full_stop(tmp_path, capsys, monkeypatch):
+    def refused(scene, reaches):
+        return SceneCheck((Finding("clearance", "0 mm", "1 mm", False),), None)
+
+    monkeypatch.setattr("surgisoft.scene.author.check_scene", refused)
+    assert new(tmp_path / "scene", ellipsoid(tmp_path), "--unit", "mm") == 1
+    said = capsys.readouterr().out.splitlines()[-1]
+    assert said.endswith("clearance: 0 mm (needs 1 mm).")
 
 
 BAD = [

@@ -25,7 +25,7 @@ from pathlib import Path
 import tomli_w
 
 from surgisoft.errors import InputError
-from surgisoft.files import write_atomically
+from surgisoft.files import resolved, write_atomically
 
 LARGEST_BYTES = 1_000_000
 """A larger file is no configuration and is not parsed."""
@@ -93,7 +93,7 @@ class Where:
 def path_beside(where: Where, text: str, what: str) -> Path:
     """The file or folder that a field names, relative to its file; an InputError where none is."""
     try:
-        found = (where.path.resolve().parent / text).resolve()
+        found = resolved(resolved(where.path).parent / text)
         there = found.exists()
     except (OSError, ValueError):  # too long a name, a zero byte
         there = False

@@ -6,6 +6,7 @@ to new files. `noted_writes` collects what was written, for a message after an i
 """
 
 import contextlib
+import errno
 import json
 import math
 import os
@@ -74,7 +75,7 @@ def new_folder(folder: str | Path, own: Sequence[str] = ()) -> Iterator[Path]:
     Where `folder` exists, the new one replaces it. Old files that the new folder does not have are
     copied to it, except those named in `own`, which belong to the old version.
     """
-    given, folder = Path(folder), Path(folder).resolve()
+    given, folder = Path(folder), resolved(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     fresh = _beside(folder)
     fresh.mkdir()
@@ -95,6 +96,17 @@ def new_folder(folder: str | Path, own: Sequence[str] = ()) -> Iterator[Path]:
         shutil.rmtree(old)
     finally:
         shutil.rmtree(fresh, ignore_errors=True)
+
+
+def resolved(path: str | Path) -> Path:
+    """Where a path leads, links followed; links in a circle raise an OSError in every Python.
+
+    Before Python 3.13 `Path.resolve` raises a RuntimeError for them.
+    """
+    try:
+        return Path(path).resolve()
+    except RuntimeError:
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path)) from None
 
 
 def write_atomically(path: str | Path, content: bytes | str, noted: bool = True) -> None:

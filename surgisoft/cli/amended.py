@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from surgisoft.errors import InputError
+from surgisoft.files import resolved
 
 NOT_CLAIMED = 1
 """Exit code where the held-out error did not fall significantly."""
@@ -13,7 +14,7 @@ def claim_other_folder(output: Path, model: Path, force: bool) -> None:
     read."""
     from surgisoft.surrogate.checkpoint import claim_folder
 
-    if output.resolve() == model.resolve():
+    if resolved(output) == resolved(model):
         raise InputError(
             f"{output}: is the folder of the model to amend; choose another one for the result"
         )

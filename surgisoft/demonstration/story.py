@@ -23,7 +23,7 @@ from surgisoft.diagnosis.pages.compare import write_report
 from surgisoft.diagnosis.pages.diagnosis import diagnosis_page
 from surgisoft.diagnosis.residuals import residual_table
 from surgisoft.errors import InputError
-from surgisoft.files import note_written
+from surgisoft.files import note_written, resolved
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.progress import Progress, Stages, silent
 from surgisoft.replay.episode_view import write_replay
@@ -242,7 +242,7 @@ def _claim(folder: Path) -> None:
     """Raise InputError unless the folder can be made, or is empty."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: already exists; choose another folder with -o")
-    if folder.resolve() == Path.cwd():
+    if resolved(folder) == Path.cwd():
         raise InputError(f"{folder}: is the present folder, expected a new one; name it with -o")
     above = next(place for place in folder.absolute().parents if place.exists())
     if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):

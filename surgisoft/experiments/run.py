@@ -35,7 +35,7 @@ from surgisoft.experiments.spec import (
     load_experiment,
     save_experiment,
 )
-from surgisoft.files import json_safe, new_folder, read_json, write_json
+from surgisoft.files import json_safe, new_folder, read_json, resolved, write_json
 from surgisoft.progress import Progress, silent
 from surgisoft.rig.registry import SIMULATED, parse_rig
 from surgisoft.surrogate.code import name_code, named_code
@@ -221,7 +221,7 @@ def run_experiment(
                 done += job.count
                 report(done, total, job.setting.words)
     else:
-        for job, found in _in_processes(spec, folder.resolve(), left, processes, cluster):
+        for job, found in _in_processes(spec, resolved(folder), left, processes, cluster):
             warn(found)
             done += job.count
             report(done, total, job.setting.words)

@@ -21,7 +21,7 @@ from surgisoft.experiments.plan import settings
 from surgisoft.experiments.results import Results, drop_logs, sum_up, write_tables
 from surgisoft.experiments.run import DROPPED, open_results, run_experiment
 from surgisoft.experiments.spec import SCRIPTED, Experiment, load_experiment
-from surgisoft.files import write_atomically
+from surgisoft.files import resolved, write_atomically
 from surgisoft.progress import Progress, silent
 from surgisoft.replay.episode_view import write_replay
 from surgisoft.report import write_page
@@ -116,7 +116,7 @@ def with_policy(spec: Experiment, folder: str | Path) -> Experiment:
     trained = RunFolder(folder).config["task"]
     if trained != spec.scenario:
         raise InputError(f"{folder}: was trained on {trained}; expected a run of {spec.scenario}")
-    path = RunFolder(folder).path.resolve()
+    path = resolved(RunFolder(folder).path)
     twins = tuple(
         replace(case, name=f"{case.name}-{path.name}", policy=str(path))
         for case in spec.cases

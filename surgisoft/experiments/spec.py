@@ -22,6 +22,7 @@ from surgisoft.config import (
     write_toml,
 )
 from surgisoft.errors import InputError
+from surgisoft.files import resolved
 from surgisoft.scene.spec import SCENES, Length, Name, Point
 from surgisoft.tasks.registry import spec_of, task_names, with_present_names
 from surgisoft.tasks.spec import TaskSpec
@@ -289,7 +290,7 @@ def save_experiment(spec: Experiment, path: Path) -> None:
 
     What the package brings along is written by its name, which holds in every installation.
     """
-    folder = path.parent.resolve()
+    folder = resolved(path.parent)
     table = _without_none(to_table(spec))
     for name in ("scene", "arm"):
         table["task"].pop(name, None)

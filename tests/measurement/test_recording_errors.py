@@ -303,3 +303,23 @@ def test_numbers_of_thousands_of_digits_in_names(tmp_path, name):
     path = tmp_path / "bad.csv"
     path.write_text(f"{HEAD},{name}\n{ROW},1\n")
     assert "not a column's name" in error_of(path)
+
+
+@pytest.mark.parametrize("name", ["loop.csv", "loop.parquet", "loop", "loop/a.csv"])
+def test_links_in_a_circle_are_one_line(name, tmp_path):
+    link = tmp_path / name.split("/")[0]
+    link.symlink_to(link.name)
+    with pytest.raises(InputError) as error:
+        load_recordings(tmp_path / name)
+    said = str(error.value)
+    assert said.startswith(f"{tmp_path / name}: cannot be read (Too many levels of symbolic links)")
+    assert "\n" not in said
+
+
+def test_a_folder_without_permission_is_one_line(tmp_path, monkeypatch):
+    def refuse(folder):
+        raise PermissionError(13, "Permission denied", str(folder))
+
+    monkeypatch.setattr("pathlib.Path.iterdir", refuse)  # root may read every folder
+    with pytest.raises(InputError, match=r"cannot be read \(Permission denied\), expected a file"):
+        load_recordings(tmp_path)

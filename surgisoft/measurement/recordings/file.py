@@ -12,7 +12,7 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 
 from surgisoft.errors import InputError, exists_already
-from surgisoft.files import new_file, new_folder
+from surgisoft.files import new_file, new_folder, resolved
 from surgisoft.measurement.recordings.columns import Layout, parse_header
 from surgisoft.measurement.recordings.log import SUFFIX as LOG_SUFFIX
 from surgisoft.measurement.recordings.log import read_log
@@ -82,11 +82,19 @@ def _find(paths: list[Path], warn: Warn) -> list[Path]:
     found: list[Path] = []
     seen: set[Path] = set()
     for path in paths:
-        for file in _in_folder(path) if path.is_dir() else [path]:
-            if file.resolve() in seen:
+        try:
+            files = _in_folder(path) if path.is_dir() else [path]
+            places = [resolved(file) for file in files]
+        except OSError as error:  # links in a circle, a folder without permission
+            raise InputError(
+                f"{path}: cannot be read ({error.strerror}), expected a file or a folder of "
+                "recordings"
+            ) from None
+        for file, place in zip(files, places, strict=True):
+            if place in seen:
                 warn(f"{file}: given twice, read once")
                 continue
-            seen.add(file.resolve())
+            seen.add(place)
             found.append(file)
     return found
 

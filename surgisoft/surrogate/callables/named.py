@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from surgisoft.errors import InputError
+from surgisoft.files import resolved
 
 GROUP = "surgisoft.models"
 """Entry point group of callable models in installed packages."""
@@ -253,7 +254,7 @@ def _run_file(path: Path, content: bytes) -> ModuleType:
     if spec is None:
         raise ImportError("not a Python file")
     module = importlib.util.module_from_spec(spec)
-    folder = str(path.resolve().parent)
+    folder = str(resolved(path).parent)
     if folder not in sys.path:
         sys.path.append(folder)
     sys.modules[module_name] = module

@@ -630,7 +630,7 @@ def budget(
 @app.command()
 def guard(
     against: Annotated[
-        str, typer.Argument(help="Commit or tag to compare with; default: the last tag.")
+        str, typer.Argument(help="Commit or tag to compare with; default: the last tag, if any.")
     ] = "",
     repeats: Annotated[int, typer.Option(min=3, help="Interleaved repeats of each side.")] = 7,
 ) -> None:

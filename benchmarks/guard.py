@@ -2,6 +2,8 @@
 
     surgisoft benchmark guard [COMMIT]
 
+Without COMMIT the last tag is the earlier one; where there is no tag, COMMIT is needed.
+
 Both versions run in processes of their own, which take turns on the same core, because absolute
 times on a shared machine say little. Each operation is timed by processor time; the ratio is that
 of the two least times. The guard fails where an operation takes more than `LIMIT` times as long.
@@ -108,10 +110,8 @@ OPERATIONS = (
 
 def run(against: str = "", repeats: int = 7) -> bool:
     """Print a table of ratios; whether no operation is slower than the limit allows."""
-    commit = against or _git("describe", "--tags", "--abbrev=0") or "HEAD"
-    name = _git("rev-parse", "--short", commit)
-    if not name:
-        raise InputError(f"guard: '{commit}' is no commit, expected a tag, a branch or a hash")
+    commit, name = commit_to_compare(against)
+    print(f"compared with {commit} ({name}): {_git('log', '-1', '--format=%cs, %s', name)}")
     with tempfile.TemporaryDirectory() as folder:
         archive = subprocess.run(
             ["git", "archive", commit], cwd=ROOT, capture_output=True, check=True
@@ -128,9 +128,27 @@ def run(against: str = "", repeats: int = 7) -> bool:
     return _print(f"{commit} ({name})", table)
 
 
-def _git(*arguments: str) -> str:
-    """Output of a git command in this repository; nothing where it fails."""
-    done = subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True)
+def commit_to_compare(against: str = "", root: Path = ROOT) -> tuple[str, str]:
+    """The commit as it is named, and its short hash; without a name the last tag.
+
+    Raises InputError where there is no such commit, or no name and no tag: a clean tree would be
+    compared with itself.
+    """
+    commit = against or _git("describe", "--tags", "--abbrev=0", root=root)
+    if not commit:
+        raise InputError(
+            "guard: no tag to compare with, expected a COMMIT, such as 'surgisoft benchmark guard "
+            "HEAD~20'"
+        )
+    name = _git("rev-parse", "--short", "--verify", "--quiet", f"{commit}^{{commit}}", root=root)
+    if not name:
+        raise InputError(f"guard: '{commit}' is no commit, expected a tag, a branch or a hash")
+    return commit, name
+
+
+def _git(*arguments: str, root: Path = ROOT) -> str:
+    """Output of a git command in a repository; nothing where it fails."""
+    done = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True)
     return done.stdout.strip() if done.returncode == 0 else ""
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 import torch.distributed as dist
 
-from surgisoft.errors import InputError
+from surgisoft.tasks.arguments import device_of
 
 
 @dataclass(frozen=True)
@@ -77,11 +77,7 @@ def _device() -> torch.device:
 @contextlib.contextmanager
 def processes(device: str) -> Iterator[tuple[Processes, torch.device]]:
     """Rank and device of this process among those that torchrun started."""
-    if device.split(":")[0] not in ("cpu", "cuda"):
-        raise InputError(f"--device '{device}': expected cpu or cuda")
-    kind = torch.device(device)
-    if kind.type == "cuda" and not torch.cuda.is_available():
-        raise InputError(f"--device '{device}': PyTorch finds no GPU; use --device cpu")
+    kind = device_of(device, "--device")
     count = int(os.environ.get("WORLD_SIZE", "1"))
     if count == 1:
         yield Processes(), kind

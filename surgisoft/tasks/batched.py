@@ -11,11 +11,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
 from surgisoft.memory import keep_freed_memory
+from surgisoft.tasks.arguments import actions_of, whole
 from surgisoft.tasks.base import Episodes, Task, TaskState
 from surgisoft.tasks.registry import make_with
 from surgisoft.tasks.world.images import VECTOR, images_of
@@ -62,8 +64,7 @@ class BatchedEnv:
         """seed: environment i begins with the episode of seed + i, as `parallel_env` of that seed;
         spread: the first episodes begin at different steps, so that they do not all end at once.
         """
-        if num_envs < 1:
-            raise InputError(f"num_envs is {num_envs}, expected 1 or more")
+        num_envs = whole("num_envs", num_envs, 1)
         keep_freed_memory()
         self.task, self.num_envs, self.device = task, num_envs, task.world.device
         self.agents = tuple(task.agents)
@@ -94,6 +95,7 @@ class BatchedEnv:
     def reset(self, seed: int = 0) -> dict[str, Tensor]:
         """Begin all episodes; environment i has seed + i. Returns the observations, which
         are those of a `BatchedStep`."""
+        seed = whole("seed", seed)
         each = [streams(seed + i, 1, 0, self.device) for i in range(self.num_envs)]
         state = self._episodes.start(joined(each))
         if self._spread:
@@ -103,19 +105,10 @@ class BatchedEnv:
         return self._with_images(self._episodes.observe(state), self._drawn(state))
 
     @torch.inference_mode()
-    def step(self, actions: Mapping[str, Tensor]) -> BatchedStep:
-        """Advance all environments; actions: agent -> (B, m) kPa."""
-        held = {}
-        for agent in self.agents:
-            if agent not in actions:
-                raise InputError(f"no action for {agent}: expected {', '.join(self.agents)}")
-            expected = (self.num_envs, self.action_sizes[agent])
-            if tuple(actions[agent].shape) != expected:
-                raise InputError(
-                    f"action of '{agent}' has shape {tuple(actions[agent].shape)}, "
-                    f"expected {expected}"
-                )
-            held[agent] = actions[agent].to(self.device, torch.float32)
+    def step(self, actions: Mapping[str, Tensor | np.ndarray]) -> BatchedStep:
+        """Advance all environments; actions: agent -> (B, m) kPa, tensors or arrays."""
+        shapes = {agent: (self.num_envs, size) for agent, size in self.action_sizes.items()}
+        held = actions_of(actions, shapes, self.device)
         state, outcome = self._episodes.step(self._now, held)
         images = self._drawn(state)
         final = self._with_images(self._episodes.observe(state), images)
@@ -185,4 +178,8 @@ def batched_env(
     """
     if isinstance(task, str):
         task = make_with(task, config, device, scene, arm, geometry, images, image_pixels)
+    if not hasattr(task, "world"):
+        raise InputError(
+            f"task is of type {type(task).__name__}, expected the name of a task or a task"
+        )
     return BatchedEnv(task, num_envs, seed, spread)

@@ -21,6 +21,7 @@ import torch
 from surgisoft.config import Where, from_table, merged, read_toml, to_table
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.tasks.area_ablation import AREA_ABLATION
+from surgisoft.tasks.arguments import check_path, device_of, whole
 from surgisoft.tasks.base import DocumentedTask, Task
 from surgisoft.tasks.breathing_ablation import BREATHING_ABLATION
 from surgisoft.tasks.circle_ablation import CIRCLE_ABLATION
@@ -56,6 +57,11 @@ BOUNDED_ELSEWHERE = ("loops", "scene")
 """Fields of a configuration that `MOST_COUNT` is not for: loops are bounded by the steps."""
 
 
+PATHS = {
+    "scene": "the folder of a scene",
+    "arm": "the folder of an arm model, or 'default'",
+}
+"""Fields of a configuration that name a folder, and what it is."""
 GROUP = "surgisoft.tasks"
 """Entry point group of tasks in other packages."""
 
@@ -173,7 +179,14 @@ def make_with(
         "image_pixels": image_pixels,
     }
     given = {field: value for field, value in changes.items() if value is not None}
-    return make_task(name, with_fields(config, **given), device)
+    for field, what in PATHS.items():
+        if field in given:
+            check_path(field, given[field], what)
+    if not isinstance(given.get("images", ""), str):
+        raise InputError(f"images is {images!r}, expected kinds of image with commas in between")
+    if "image_pixels" in given:
+        given["image_pixels"] = whole("image_pixels", image_pixels)
+    return make_task(name, with_fields(config, **given), device_of(device))
 
 
 def config_of(task: str) -> Any:

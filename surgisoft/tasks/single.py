@@ -20,6 +20,7 @@ from torch import Tensor
 
 from surgisoft.environments import register
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.tasks.arguments import whole
 from surgisoft.tasks.base import DocumentedTask, Task, TaskState
 from surgisoft.tasks.numpy_adapter import RGB_ARRAY, NumpyAdapter, Pictures, entropy_seed, in_one
 from surgisoft.tasks.observations import ObservationBlocks
@@ -183,8 +184,7 @@ class BatchedEnv(VectorEnv):
 
         agent, images and image_pixels are as for `SingleEnv`.
         """
-        if num_envs < 1:
-            raise InputError(f"num_envs is {num_envs}, expected 1 or more")
+        num_envs = whole("num_envs", num_envs, 1)
         shown = (agent, images, image_pixels)
         self.adapter, self._agent = _adapter(task, config, device, scene, arm, geometry, *shown)
         self._state: TaskState | None = None

@@ -1,0 +1,80 @@
+"""Wrong arguments of environments are refused in one line; arrays are as good as tensors."""
+
+import numpy as np
+import pytest
+import torch
+
+import surgisoft
+from surgisoft.errors import InputError
+from surgisoft.tasks.arguments import device_of
+from surgisoft.tasks.single import BatchedEnv
+
+WRONG = [
+    ({"device": "tpu"}, "device 'tpu': expected cpu or cuda"),
+    ({"device": "cpu:x"}, "device 'cpu:x': expected cpu, cuda or cuda:NUMBER"),
+    ({"num_envs": 1.5}, "num_envs is 1.5, expected a whole number, 1 or more"),
+    ({"num_envs": "4"}, "num_envs is '4', expected a whole number, 1 or more"),
+    ({"num_envs": 0}, "num_envs is 0, expected 1 or more"),
+    ({"seed": "a"}, "seed is 'a', expected a whole number"),
+    ({"arm": {"laser": "default"}}, "arm is of type dict, expected the folder of an arm model"),
+    ({"arm": 5}, "arm is of type int, expected the folder of an arm model, or 'default'"),
+    ({"scene": 5}, "scene is of type int, expected the folder of a scene"),
+    ({"images": 5}, "images is 5, expected kinds of image with commas in between"),
+    ({"images": "rgb", "image_pixels": "a"}, "image_pixels is 'a', expected a whole number"),
+    ({"task": 5}, "task is of type int, expected the name of a task or a task"),
+]
+
+
+@pytest.mark.parametrize(("wrong", "says"), WRONG, ids=[says for _, says in WRONG])
+def test_a_wrong_argument_of_a_batch_is_one_line(wrong, says):
+    with pytest.raises(InputError) as error:
+        surgisoft.batched_env(**{"task": "circle_ablation", "num_envs": 2} | wrong)
+    assert str(error.value).startswith(says)
+    assert "\n" not in str(error.value)
+
+
+def test_a_gpu_that_is_not_there_is_one_line(monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    says = "device 'cuda': PyTorch finds no GPU; use device cpu"
+    for make in (surgisoft.parallel_env, lambda *a, **k: surgisoft.batched_env(*a, 2, **k)):
+        with pytest.raises(InputError, match=says):
+            make("track_circle", device="cuda")
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
+    assert device_of("cuda:1") == torch.device("cuda", 1)
+    with pytest.raises(InputError, match="no such GPU; the last is cuda:1"):
+        device_of("cuda:2")
+
+
+def test_a_count_of_a_vector_environment_is_whole():
+    with pytest.raises(InputError, match="num_envs is 2.5, expected a whole number"):
+        BatchedEnv("track_circle", num_envs=2.5)
+    assert BatchedEnv("track_circle", num_envs=np.int64(2)).num_envs == 2
+
+
+def test_arrays_and_tensors_are_the_same_actions():
+    pressures = np.random.default_rng(0).uniform(-3.0, 3.0, (5, 3, 3)).astype(np.float32)
+    kinds = (np.array, torch.tensor, lambda kPa: kPa.astype(">f8"), lambda kPa: kPa.tolist())
+    points = []
+    for kind in kinds:
+        env = surgisoft.batched_env("track_circle", num_envs=3, seed=4)
+        for kPa in pressures:
+            step = env.step({"arm": kind(kPa)})
+        points.append(step.observations["arm"])
+    for other in points[1:]:
+        assert torch.equal(other, points[0])
+
+
+@pytest.mark.parametrize(
+    ("actions", "says"),
+    [
+        (np.zeros((2, 3)), "actions are of type ndarray, expected a dict of arm"),
+        ({}, "no action for arm: expected arm"),
+        ({"arm": "open"}, "action of 'arm' is of type str, expected a tensor or an array of numb"),
+        ({"arm": np.zeros((2, 4))}, r"action of 'arm' has shape \(2, 4\), expected \(2, 3\)"),
+    ],
+)
+def test_a_wrong_action_is_one_line(actions, says):
+    env = surgisoft.batched_env("track_circle", num_envs=2)
+    with pytest.raises(InputError, match=says):
+        env.step(actions)

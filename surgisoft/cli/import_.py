@@ -116,8 +116,12 @@ def _draft(raw: list[Path], place: Path, force: bool) -> None:
     from surgisoft.files import write_atomically
     from surgisoft.measurement.importing import draft_map
 
-    if len(raw) != 1 or raw[0].is_dir():
-        raise InputError(f"--draft: {len(raw)} raw files or a folder, expected one file")
+    if len(raw) != 1:
+        raise InputError(f"--draft: got {len(raw)} raw files, expected one of them")
+    if raw[0].is_dir():
+        inside = sorted(path for path in raw[0].iterdir() if path.is_file())
+        such = f", such as {inside[0]}" if inside else ""
+        raise InputError(f"--draft: {raw[0]} is a folder, expected one file of it{such}")
     if place.suffix != ".toml":
         raise InputError(f"{place}: suffix '{place.suffix}', expected .toml")
     if place.exists() and not force:

@@ -63,8 +63,8 @@ class VirtualRigConfig:
     noise: float = 1.0
     """Factor on all sensor and camera noise."""
     take: int = 0
-    """Number of the trial, which `--trial` of `collect` sets: another one has other noise on the same
-    robot."""
+    """Number of the trial, which `--trial` of `collect` sets: another one has other noise on the
+    same robot."""
     hidden: tuple[tuple[str, float], ...] = ()
     """Hidden effects: (name, amplitude), see hidden.py. An entry (name, amplitude, seconds) counts
     to `later`."""

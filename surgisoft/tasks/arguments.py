@@ -39,6 +39,8 @@ def device_of(device: str | torch.device, label: str = "device") -> torch.device
 
 def whole(name: str, value: Any, least: int | None = None) -> int:
     """A whole number, Python's or NumPy's, that is not below `least`."""
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
     try:
         number = operator.index(value)
     except TypeError:

@@ -47,7 +47,7 @@ def test_a_gpu_that_is_not_there_is_one_line(monkeypatch):
 
 
 def test_a_count_of_a_vector_environment_is_whole():
-    with pytest.raises(InputError, match="num_envs is 2.5, expected a whole number"):
+    with pytest.raises(InputError, match=r"num_envs is 2\.5, expected a whole number"):
         BatchedEnv("track_circle", num_envs=2.5)
     assert BatchedEnv("track_circle", num_envs=np.int64(2)).num_envs == 2
 

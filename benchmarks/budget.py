@@ -33,9 +33,12 @@ from surgisoft.agents.distributed import Processes
 from surgisoft.agents.training import Training
 from surgisoft.compiled import compiled
 from surgisoft.scene.ablation import REACH_WAISTS, AblationMap
-from surgisoft.scene.batched import BatchedScene
+from surgisoft.scene.batched import EXACT_WITHIN_MM, BatchedScene
+from surgisoft.scene.capsules import ArmShape
+from surgisoft.scene.collision import CollisionChecker
 from surgisoft.surrogate.effects.hysteresis import Hysteresis
 from surgisoft.tasks.base import Episodes
+from surgisoft.tasks.batched import BatchedEnv
 from surgisoft.tasks.registry import make_task
 from surgisoft.tasks.world.arm import ModelArm
 from surgisoft.tasks.world.scene import SceneEngine
@@ -72,6 +75,8 @@ TIMED: tuple[tuple[Any, str, str], ...] = (
 """What is timed: the owner of a function, its name, and the part that its time belongs to."""
 WHOLE = ("resets",)
 """Parts whose calls of other parts count as theirs."""
+STATES, WALK = 200, 20
+"""Random states that are compared with FCL, and steps to them from the beginnings of episodes."""
 LEAST_STEPS, LEAST_S = 6_000, 1.5
 """A row is measured over at least so many steps of an episode, or so many seconds."""
 
@@ -336,8 +341,99 @@ def measured(task_name: str, envs: int) -> Row:
     return Row(task_name, envs, must, spent, products)
 
 
-def markdown(rows: list[Row], rates: Rates) -> str:
-    """The tables of `docs/results/speed.md`."""
+@dataclass(frozen=True)
+class AgainstFcl:
+    """How far the batched geometry, whose speed is measured, is from FCL in random states."""
+
+    states: int
+    """Number of states."""
+    near: int
+    """States in which something is nearer than `EXACT_WITHIN_MM`, or touches."""
+    clearance_off_mm: float
+    """Largest difference of the least clearance in those states, mm."""
+    far_off_mm: float
+    """The same in the others, where the batched geometry interpolates in a field."""
+    contact_differs: int
+    """States in which only one of the two finds an overlap."""
+    beams: int
+    """Number of beams."""
+    beam_off_mm: float
+    """Largest distance between both ends of a beam that meets the same thing, mm."""
+    beam_differs: int
+    """Beams that meet another thing."""
+
+    @property
+    def line(self) -> str:
+        """The result in one line."""
+        found = (
+            f"Against FCL in {self.states} random states: clearance at most "
+            f"{self.clearance_off_mm:.2g} mm off in the {self.near} states nearer than "
+            f"{EXACT_WITHIN_MM:g} mm and {self.far_off_mm:.2g} mm in the others, "
+            f"contact differs in {self.contact_differs}"
+        )
+        if self.beams:
+            found += (
+                f"; end of the beam at most {self.beam_off_mm:.2g} mm off, what it meets differs "
+                f"in {self.beam_differs} of {self.beams}"
+            )
+        return found + "."
+
+
+def against_fcl(task_name: str, states: int = STATES, seed: int = 0) -> AgainstFcl | None:
+    """Compare clearance, contact and beams of random states with FCL; None without a scene.
+
+    Each of the episodes holds a random change of pressure for `WALK` steps, which are of different
+    parts of an episode.
+    """
+    task = make_task(task_name)
+    around = task.world.scene
+    if around is None:
+        return None
+    env, draw = BatchedEnv(task, states, seed, spread=True), torch.Generator().manual_seed(seed)
+    held = {
+        agent: env.action_limits_kPa[agent] * (2.0 * torch.rand(states, size, generator=draw) - 1.0)
+        for agent, size in env.action_sizes.items()
+    }
+    for _ in range(WALK):
+        env.step(held)
+    world = env.state.world
+    scene = world.scene
+    clearance, exact = scene.clearance, CollisionChecker(around.geometry.bodies)
+    engine = around if isinstance(around, SceneEngine) else None
+    placement = engine.placement(scene.breaths) if engine else None
+    lines = {name: part.line_mm.double().numpy() for name, part in world.arms.items()}
+    least, touches = clearance.least_mm.numpy(), clearance.collides.numpy()
+    off, far_off, near, contacts = 0.0, 0.0, 0, 0
+    beam_off, beam_differs = 0.0, 0
+    for n in range(states):
+        checker = exact if placement is None else exact.moved(placement, n)
+        arms = {
+            name: ArmShape(line[n], around.geometry.radius_mm(name)) for name, line in lines.items()
+        }
+        contacts += bool(checker.collisions(arms)) != bool(touches[n])
+        away = checker.clearance(arms).least_mm
+        if min(away, least[n]) < EXACT_WITHIN_MM:
+            near += 1
+            off = max(off, abs(away - float(least[n])))
+        else:
+            far_off = max(far_off, abs(min(away, exact.horizon_mm) - float(least[n])))
+        for laser, hit in scene.hits.items():
+            beam = world.arms[laser]
+            place = (beam.tip_mm[n].double().numpy(), beam.tip_direction[n].double().numpy())
+            end = checker.cast(*place, engine.beam_mm, arms, own=laser)
+            if int(end.struck) != int(hit.struck[n]):
+                beam_differs += 1
+            else:
+                apart = np.asarray(end.point_mm) - hit.point_mm[n].double().numpy()
+                beam_off = max(beam_off, float(np.linalg.norm(apart)))
+    beams = states * len(scene.hits)
+    return AgainstFcl(states, near, off, far_off, contacts, beams, beam_off, beam_differs)
+
+
+def markdown(
+    rows: list[Row], rates: Rates, exact: dict[str, AgainstFcl | None] | None = None
+) -> str:
+    """The tables of `docs/results/speed.md`; exact: task -> its error against FCL."""
     lines = [
         f"One processor: matrix products {rates.products / 1e9:.0f} Gop/s, compiled scalar "
         f"arithmetic {rates.scalar / 1e9:.1f} Gop/s, copies {rates.bytes / 1e9:.1f} GB/s (each row "
@@ -350,6 +446,7 @@ def markdown(rows: list[Row], rates: Rates) -> str:
         lines += [
             f"## {task}",
             "",
+            *([found.line, ""] if (found := (exact or {}).get(task)) else []),
             "| part | " + " | ".join(f"{row.envs:,} envs" for row in some) + " |",
             "|---|" + "---|" * len(some),
         ]
@@ -398,4 +495,6 @@ def run(
 if __name__ == "__main__":
     import sys
 
-    print(markdown(*run(sys.argv[1].split(","), [int(n) for n in sys.argv[2].split(",")])))
+    names = sys.argv[1].split(",")
+    found = run(names, [int(n) for n in sys.argv[2].split(",")])
+    print(markdown(*found, {name: against_fcl(name) for name in names}))

@@ -615,7 +615,7 @@ def budget(
     output: Output = None,
 ) -> None:
     """Least possible and measured cost of each part of a training step on this machine."""
-    from benchmarks.budget import markdown, run
+    from benchmarks.budget import against_fcl, markdown, run
     from surgisoft.tasks.registry import spec_of
 
     names, counts = tasks.split(","), _numbers("--envs", envs)
@@ -624,7 +624,8 @@ def budget(
     with progress("budget") as report:
         rows, rates = run(names, counts, report)
     command = f"surgisoft benchmark budget --tasks {tasks} --envs {envs}"
-    _show("Budget of a training step", command, markdown(rows, rates), output)
+    exact = {name: against_fcl(name) for name in names}
+    _show("Budget of a training step", command, markdown(rows, rates, exact), output)
 
 
 @app.command()

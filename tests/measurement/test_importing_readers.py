@@ -355,3 +355,34 @@ def test_an_hdf5_file_cannot_claim_gigabytes_or_other_files(tmp_path):
         file["u"] = np.arange(3.0)
     with pytest.raises(InputError, match=r"expected one of u$"):  # the other file is left out
         import_files([path], load_map(write_map(tmp_path, "hdf5")), "r")
+
+
+TRC = (
+    "PathFileType\t4\t(X/Y/Z)\tcapture.trc\nDataRate\tCameraRate\tNumFrames\tUnits\n"
+    "100\t100\t2\tmm\nFrame#\tTime\ttip\n\t\tX1\tY1\tZ1\n\n1\t0.0\t1\t2\t3\n2\t0.01\t1\t2\t4\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "kind"),
+    [
+        ("capture.trc", TRC.encode(), "a TRC file (motion capture"),
+        ("state.pkl", b"\x80\x03]q.", "a Python pickle"),
+        ("state.pickle", b"(lp0\n.", "a Python pickle"),
+        ("state.npy", b"\x93NUMPY\1", "a NumPy array"),
+    ],
+)
+def test_a_known_format_without_a_zero_byte_is_named_too(tmp_path, name, content, kind):
+    """The text of a motion capture system, and short files of Python."""
+    (tmp_path / name).write_bytes(content)
+    said = rf"{name}: {re.escape(kind)}.*, for which there is no reader; export it as CSV"
+    with pytest.raises(InputError, match=said) as error:
+        import_files([tmp_path / name], load_map(write_map(tmp_path, "auto")), "r")
+    assert "\n" not in str(error.value)
+
+
+def test_a_draft_of_a_pickle_names_the_format(tmp_path, capsys):
+    (tmp_path / "state.pkl").write_bytes(b"\x80\x03]q.")
+    command = ["import", str(tmp_path / "state.pkl"), "--draft", str(tmp_path / "new.toml")]
+    assert run(command) == 2
+    assert "state.pkl: a Python pickle, for which there is no reader" in capsys.readouterr().err

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.importing.raw import FileRole
-from surgisoft.measurement.importing.readers import chosen, open_raw
+from surgisoft.measurement.importing.readers import chosen, no_text, open_raw
 from surgisoft.measurement.importing.readers.text import READER as TEXT
 from surgisoft.measurement.recordings.columns import MM_PER
 from surgisoft.measurement.tables import read_text
@@ -83,7 +83,10 @@ def draft_map(path: str | Path) -> str:
     columns of key points are recognised.
     """
     path = Path(path)
-    layout = _layout(path) if chosen(path, FileRole()) is TEXT else _table_layout(path)
+    try:
+        layout = _layout(path) if chosen(path, FileRole()) is TEXT else _table_layout(path)
+    except InputError as error:
+        raise no_text(path, error) from error
     names, label = layout.names, layout.label
     points = [*_key_points(names), *(_key_point_arrays(layout) if layout.paths else [])]
     if not points:

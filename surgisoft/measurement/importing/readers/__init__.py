@@ -43,15 +43,21 @@ BINARY = ("c3d", "matlab", "hdf5")
 NOT_READ = {
     "bag": "a ROS bag",
     "db3": "a ROS 2 bag in SQLite ('ros2 bag convert' makes MCAP of it)",
-    "trc": "a TRC file (OpenSim)",
+    "trc": "a TRC file (motion capture, OpenSim)",
     "mot": "a motion file of OpenSim",
     "vsk": "a Vicon skeleton",
     "tdms": "a LabVIEW TDMS file",
     "npz": "NumPy arrays",
+    "npy": "a NumPy array",
+    "pkl": "a Python pickle",
+    "pickle": "a Python pickle",
     "xlsx": "an Excel workbook",
     "xls": "an Excel workbook",
 }
 """Known formats that no reader of this package reads, by their files' ending."""
+
+NEVER_TEXT = ("pkl", "pickle", "npy", "npz")
+"""Endings of NOT_READ whose files are never text, though a short one may hold no zero byte."""
 
 ADVICE = "export it as CSV, or add a reader (docs/recordings.md)"
 """What to do with a format that no reader reads."""
@@ -93,10 +99,23 @@ def chosen(path: Path, role: FileRole) -> Reader:
     for name in formats()[1:]:
         if path.suffix.lower() in (known := reader(name)).suffixes:
             return known if name not in BINARY or _is_binary(path) else text.READER
-    kind = NOT_READ.get(path.suffix.lower().removeprefix("."))
-    if kind and _is_binary(path):
+    kind = NOT_READ.get(_ending(path))
+    if kind and (_ending(path) in NEVER_TEXT or _is_binary(path)):
         raise InputError(f"{path}: {kind}, for which there is no reader; {ADVICE}")
     return text.READER
+
+
+def _ending(path: Path) -> str:
+    return path.suffix.lower().removeprefix(".")
+
+
+def no_text(path: Path, error: InputError) -> InputError:
+    """The error of a file that was read as text, with its kind where its ending tells it."""
+    kind = NOT_READ.get(_ending(path))
+    if kind is None:
+        return error
+    reason = str(error).removeprefix(f"{path}: ").partition(":")[0].partition(";")[0]
+    return InputError(f"{path}: {kind}, for which there is no reader; {ADVICE} (as text: {reason})")
 
 
 def _is_binary(path: Path) -> bool:
@@ -112,7 +131,11 @@ def open_raw(path: Path, role: FileRole) -> RawTable:
     found = chosen(path, role)
     try:
         return found.read(path, role)
-    except (InputError, OSError):
+    except InputError as error:
+        if found is text.READER and role.format == AUTO:
+            raise no_text(path, error) from error
+        raise
+    except OSError:
         raise
     except Exception as error:
         reason = f"{type(error).__name__}: {error}".splitlines()[0][:200]

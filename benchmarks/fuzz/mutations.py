@@ -520,7 +520,7 @@ KINDS: dict[str, tuple[Mutation, ...]] = {
     "h5": (change_head, change_hdf5, change_hdf5),
     "mcap": (change_mcap, change_mcap),
     "nrrd": (change_nrrd, change_nrrd, change_nrrd),
-    **dict.fromkeys(("c3d", "nii", "bin"), (change_head, change_head)),
+    **dict.fromkeys(("c3d", "nii", "bin", "db3"), (change_head, change_head)),
     **dict.fromkeys(("stl", "rrd", "glb", "field"), ()),
     **dict.fromkeys(("csv", "txt", "obj", "off", "ply"), (change_text, change_text)),
 }

@@ -7,6 +7,7 @@ sample that are mutated. A new reader is fuzzed by its line in `TARGETS`.
 import dataclasses
 import gzip
 import shutil
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -658,6 +659,34 @@ def make_mcap(folder: Path) -> None:
             bag.finish()
 
 
+def make_rosbag2(folder: Path) -> None:
+    """A ROS 2 bag in SQLite with the messages of two topics."""
+    import sqlite3
+
+    topics = (("/p", 2), ("/k", 3))
+    names = ["t_s", *(f"{topic}.data.{i}" for topic, n in topics for i in range(n))]
+    _write_map(folder / "bag", "format = 'rosbag2'\ntopics = ['/p', '/k']", names)
+    bag, kind = sqlite3.connect(folder / "bag" / "raw.db3"), "std_msgs/msg/Float64MultiArray"
+    bag.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format)")
+    bag.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data)")
+    bag.execute(
+        "CREATE TABLE message_definitions(topic_type, encoding, encoded_message_definition)"
+    )
+    definition = (kind, "ros2msg", "float64[] data\n")
+    bag.execute("INSERT INTO message_definitions VALUES (?, ?, ?)", definition)
+    for number, (topic, _) in enumerate(topics, 1):
+        bag.execute("INSERT INTO topics VALUES (?, ?, ?, 'cdr')", (number, topic, kind))
+    for t, *row in _lab_values():
+        for number, part in enumerate((row[:2], row[2:]), 1):
+            # CDR, little-endian: the length, padding to the alignment of a double, the numbers.
+            data = struct.pack(f"<4xI4x{len(part)}d", len(part), *part)
+            data = b"\0\1\0\0" + data[4:]
+            command = "INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)"
+            bag.execute(command, (number, round(1e9 * (1000.0 + t)), data))
+    bag.commit()
+    bag.close()
+
+
 CONTEXT = """
 question = "Is the arm's tip accurate enough to cut a ring?"
 use = "The model replaces the arm in training."
@@ -933,6 +962,7 @@ TARGETS: dict[str, Target] = {
     "matlab": Target(make_matlab, read_raw, ("*.mat",), imports=("scipy.io",)),
     "hdf5": Target(make_hdf5, read_raw, ("*.h5", "*.mat"), imports=("h5py",)),
     "mcap": Target(make_mcap, read_raw, ("*.mcap",), inputs=10_000),
+    "rosbag2": Target(make_rosbag2, read_raw, ("*.db3",), inputs=10_000),
     "model": Target(
         make_models, read_model, ("config.json", "*.safetensors"), weight=2, inputs=30_000
     ),

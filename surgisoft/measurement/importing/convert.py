@@ -24,7 +24,14 @@ from surgisoft.measurement.importing.points import (
     read_points,
 )
 from surgisoft.measurement.importing.raw import Column, RawTable
-from surgisoft.measurement.importing.readers import AUTO, READERS, chosen, open_raw, reader
+from surgisoft.measurement.importing.readers import (
+    AUTO,
+    OF_TOPICS,
+    READERS,
+    chosen,
+    open_raw,
+    reader,
+)
 from surgisoft.measurement.importing.rows import (
     Draft,
     point_numbers,
@@ -179,7 +186,7 @@ def _roles_served(path: Path, spec: ImportMap) -> list[str]:
     roles = _roles_of(path, spec)
     if not roles:
         raise InputError(f"{path}: fits no file of the map, expected {_patterns(spec)}")
-    if chosen(path, spec.file[roles[0]]) is not READERS["mcap"]:
+    if chosen(path, spec.file[roles[0]]) not in [READERS[name] for name in OF_TOPICS]:
         return roles[:1]
     topics = [name for name in roles[1:] if spec.file[name].topic or spec.file[name].topics]
     return [roles[0], *topics]

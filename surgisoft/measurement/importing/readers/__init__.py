@@ -17,6 +17,7 @@ from surgisoft.measurement.importing.readers import (
     mcap,
     motive,
     parquet,
+    rosbag2,
     text,
 )
 
@@ -30,6 +31,7 @@ READERS: dict[str, Reader] = {
     "parquet": parquet.READER,
     "motive": motive.READER,
     "mcap": mcap.READER,
+    "rosbag2": rosbag2.READER,
     "c3d": c3d.READER,
     "matlab": arrays.MATLAB,
     "hdf5": arrays.HDF5,
@@ -37,12 +39,14 @@ READERS: dict[str, Reader] = {
 }
 """The readers of this package."""
 
+OF_TOPICS = ("mcap", "rosbag2")
+"""Readers of files that serve every role that names a topic."""
+
 BINARY = ("c3d", "matlab", "hdf5")
 """Readers whose files are never text: a text with their ending is read as text."""
 
 NOT_READ = {
     "bag": "a ROS bag",
-    "db3": "a ROS 2 bag in SQLite ('ros2 bag convert' makes MCAP of it)",
     "trc": "a TRC file (motion capture, OpenSim)",
     "mot": "a motion file of OpenSim",
     "vsk": "a Vicon skeleton",

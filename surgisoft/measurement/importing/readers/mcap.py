@@ -15,8 +15,9 @@ import json
 import math
 import os
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -72,14 +73,31 @@ def _is_mcap(path: Path) -> bool:
         return file.read(len(MAGIC)) == MAGIC
 
 
+@dataclass(frozen=True)
+class MessageLog:
+    """A kind of file that holds messages in topics."""
+
+    about: str
+    """Kind of file, for messages: "an MCAP file"."""
+    topics: Callable[[Path], list[str]]
+    """Names of the topics of a file."""
+    messages: Callable[[Path, str], Iterator[tuple[float, Any]]]
+    """Time of the log [s] and content of each message of a topic, in the order of the log."""
+
+
 def _read(path: Path, role: FileRole) -> RawTable:
+    return read_topics(path, role, MessageLog("an MCAP file", _topics, _messages))
+
+
+def read_topics(path: Path, role: FileRole, log: MessageLog) -> RawTable:
+    """The raw table of the topics that a map names."""
     topics = [*([role.topic] if role.topic else []), *role.topics]
     if not topics:
         raise InputError(
-            f'{path}: an MCAP file, and the map names no topic; expected topic = "/NAME" in its '
-            f"[file] table, one of {', '.join(_topics(path)) or 'none'}"
+            f'{path}: {log.about}, and the map names no topic; expected topic = "/NAME" in its '
+            f"[file] table, one of {', '.join(log.topics(path)) or 'none'}"
         )
-    tables = [_table(path, topic) for topic in topics]
+    tables = [_table(path, topic, log) for topic in topics]
     first_names, first = tables[0]
     if len(tables) == 1:
         return RawTable(path, first_names, Messages(path, topics[0], first))
@@ -178,10 +196,10 @@ def _reader(path: Path, file: Any) -> Any:
     return make_reader(bounded)
 
 
-def _table(path: Path, topic: str) -> tuple[list[str], np.ndarray]:
+def _table(path: Path, topic: str, log: MessageLog) -> tuple[list[str], np.ndarray]:
     """Names of the columns, the time first, and cells (T, c) of the messages of a topic."""
     rows: list[dict[str, float]] = []
-    for log_s, message in _messages(path, topic):
+    for log_s, message in log.messages(path, topic):
         row = {TIME: log_s}
         stamp = _stamp(message)
         if stamp is not None:
@@ -189,7 +207,7 @@ def _table(path: Path, topic: str) -> tuple[list[str], np.ndarray]:
         row.update(_flat(message, ""))
         rows.append(row)
     if not rows:
-        known = ", ".join(_topics(path)) or "none"
+        known = ", ".join(log.topics(path)) or "none"
         raise InputError(f"{path}: no message of the topic '{topic}'; the file has {known}")
     names = list(dict.fromkeys(name for row in rows for name in row))
     if len(names) * len(rows) > MOST_CELLS:

@@ -28,6 +28,7 @@ from surgisoft.diagnosis.residuals import (
     ResidualTable,
     repeat_floor,
     residual_table,
+    with_training_noise,
 )
 from surgisoft.diagnosis.selection import BestAchievable, best_achievable, select
 from surgisoft.diagnosis.setup import find_setup_faults
@@ -101,13 +102,14 @@ class Comparison:
     mse_mm2: float
     """Mean squared error of a coordinate (the paper's MSE), mm^2."""
     floor: Floor
-    """The noise floor: what the lab states, else from holds, else from second differences."""
+    """The noise floor that `diagnose` states, too: what the lab states, else from holds, else from
+    second differences, of the rows that `diagnose` looks at."""
     floors: tuple[Floor, ...]
     """Every estimate of the floor that the recordings allow."""
     best_achievable: BestAchievable | None
-    """Best achievable error, the same that `diagnose` reports on the same rows: the least that the
-    model, a black box, any effect or the selected effects leave on held-out blocks. None for too
-    few rows."""
+    """Best achievable error on the rows that `diagnose` looks at, the same that it reports: the
+    least that the model, a black box, any effect or the selected effects leave on held-out blocks.
+    None for too few rows."""
     axes: tuple[AxisShare, ...]
     """How much of the error each axis explains, most first."""
     time_shift: TimeShift | None
@@ -134,19 +136,33 @@ class Comparison:
     in_fit: float | None = None
     """Share 0..1 of the rows that the model was fitted to, where its error is no test of it; None
     where the model does not say."""
+    open_rmse_mm: float | None = None
+    """RMS error on the rows of `best_achievable`, mm, which is never below that; None without it.
+    It is the error that `diagnose` states."""
+    part: Part = "all"
+    """The rows that were looked at."""
 
     @property
     def explainable(self) -> float | None:
         """Share (0..1) of the squared error above the floor that is achievable.
 
-        None without a best achievable error, or where the error is at the floor. An unknown floor
-        counts as zero.
+        All three numbers are of the rows of `best_achievable`. None without a best achievable
+        error, or where the error is at the floor. An unknown floor counts as zero.
         """
-        noise = self.floor.rmse_mm or 0.0
-        excess = self.rmse_mm**2 - noise**2
-        if self.best_achievable is None or self.rmse_mm <= AT_FLOOR * noise or excess <= 0:
+        if self.best_achievable is None or self.open_rmse_mm is None or self.at_floor:
             return None
-        return float(np.clip((self.rmse_mm**2 - self.best_achievable.rmse_mm**2) / excess, 0, 1))
+        noise = self.floor.rmse_mm or 0.0
+        excess = self.open_rmse_mm**2 - noise**2
+        if self.open_rmse_mm <= AT_FLOOR * noise or excess <= 0:
+            return None
+        fall = self.open_rmse_mm**2 - self.best_achievable.rmse_mm**2
+        return float(np.clip(fall / excess, 0, 1))
+
+    @property
+    def at_floor(self) -> bool:
+        """Whether the error over all rows that were looked at is at the noise floor."""
+        noise = self.floor.rmse_mm
+        return noise is not None and self.rmse_mm <= AT_FLOOR * noise
 
     @property
     def main_axes(self) -> list[AxisShare]:
@@ -164,10 +180,12 @@ class Comparison:
             text = f"{self.rows_of_fit}; {text}"
         if self.change is not None:
             text = f"{self.change.sentence}; {text}"
-        if noise is not None and self.rmse_mm <= AT_FLOOR * noise:
+        if self.at_floor:
             return f"{text}: the error is at the floor"
-        if self.best_achievable is None:
+        if self.best_achievable is None or self.open_rmse_mm is None:
             return f"{text}; too few rows to say what it depends on"
+        if self.part == "all":
+            text += f"; on the rows that diagnose uses error {_mm(self.open_rmse_mm)}"
         text += f", best achievable {_mm(self.best_achievable.rmse_mm)}"
         what = "error" if noise is None else "excess"
         text += f": {100 * (self.explainable or 0):.0f} % of the {what} is explainable"
@@ -228,10 +246,12 @@ def compare(
     A model of other origin is a callable, its name, or a name with its predictions in files, one
     for each recording and of `before`; error_mm: its validated error, mm (docs/your_model.md).
 
-    part: which rows of them are looked at; `diagnose` looks at the training rows. reference: as
-    for `diagnose`, which takes it into account for the best achievable error. before: recordings
-    from before a change; the comparison then also says how far the two sets differ (`pairs`), by
-    the paired difference where both have the same actuation; paired: as for `diagnose`.
+    part: which rows of them are looked at. The noise floor is that of the training rows, which
+    `diagnose` looks at, and so is the best achievable error if all rows are looked at: both
+    commands state the same numbers. reference: as for `diagnose`, which takes it into account for
+    the best achievable error. before: recordings from before a change; the comparison then also
+    says how far the two sets differ (`pairs`), by the paired difference where both have the same
+    actuation; paired: as for `diagnose`.
     test: raise InputError where the model was fitted to some of the recordings, or keeps no record
     of its fit, so that the error is a test error.
     """
@@ -242,7 +262,7 @@ def compare(
     wrong = find_setup_faults(model, recordings) if part == "all" else None
     if wrong is None:
         check_fits(model.spec, recordings)
-    whole = residual_table(model, recordings)
+    whole = with_training_noise(residual_table(model, recordings), recordings)
     if np.isnan(whole.only(part).measured_mm).all():
         raise InputError(
             "no key point was measured in any row of the recordings, expected at least one; check "
@@ -265,6 +285,10 @@ def compare(
         looked_at = table.held_out == (part == "held_out")
     per_point = np.sqrt([_nanmean(square[:, k]) for k in range(square.shape[1])])
     enough = int(seen.sum()) >= LEAST_ROWS
+    posed = problem
+    if part == "all" and enough:
+        posed = with_known_residuals(whole.view("training", least_blocks=1), reference)
+    best = achievable(posed) if enough else None
     return (
         Comparison(
             rmse_mm=float(np.sqrt(_nanmean(square))),
@@ -278,7 +302,7 @@ def compare(
             mse_mm2=_nanmean(square) / 3,
             floor=table.floor,
             floors=_floors(problem),
-            best_achievable=achievable(problem) if enough else None,
+            best_achievable=best,
             axes=tuple(shares(problem)) if enough else (),
             time_shift=time_shift(table, block),
             samples=int(seen.sum()),
@@ -291,6 +315,8 @@ def compare(
             change=None if both is None else both.change,
             change_axes=changed,
             in_fit=problem.in_fit,
+            open_rmse_mm=None if best is None else posed.rmse_mm,
+            part=part,
         ),
         table,
     )

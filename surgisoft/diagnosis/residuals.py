@@ -435,6 +435,20 @@ class Sealed:
         )
 
 
+def with_training_noise(table: ResidualTable, recordings: list[Recording]) -> ResidualTable:
+    """A table of whole recordings with the noise that `diagnose` reckons with on them.
+
+    Held-out rows decide nothing before the final check, so holds and second differences are those
+    of the training rows. Where these have no key point, the noise stays that of all rows.
+    """
+    if np.isnan(table.measured_mm[~table.held_out]).all():
+        return table
+    training = Sealed(recordings).training
+    noise, source = noise_of(training)
+    floor, holds = _floor_of(noise, source), hold_floor(training)
+    return replace(table, noise_mm=noise, floor=floor, holds=holds)
+
+
 # The rows of one part ------------------------------------------------------------------------
 
 

@@ -630,7 +630,10 @@ class Findings(Selected):
 
 @dataclass(frozen=True)
 class BestAchievable:
-    """The least error that anything reached on held-out blocks: no reported error is below it."""
+    """The least error that anything reached on held-out blocks: no reported error is below it.
+
+    A network that is fitted again (`refit`) is another model and does not count.
+    """
 
     rmse_mm: float
     """RMS distance over all key points, mm."""

@@ -1,12 +1,15 @@
 """The best achievable error reaches the noise where there is a cause, and nothing beats it."""
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from surgisoft.diagnosis.black_box import black_box
 from surgisoft.diagnosis.compare import compare
 from surgisoft.diagnosis.diagnose import diagnose
-from surgisoft.diagnosis.residuals import problem_of
+from surgisoft.diagnosis.residuals import held_out_rows, problem_of
 from surgisoft.diagnosis.selection import best_achievable
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.rig import VirtualRig
@@ -53,20 +56,78 @@ def test_noise_is_not_explained():
     slow = np.convolve(rng.normal(size=ROWS + 20), np.ones(20) / 20, mode="valid")[:ROWS]
     for effect in (np.zeros(ROWS), slow):
         result, _ = compare(still_model(), [recording(effect, pressure, noise_mm=None)])
-        assert result.best_achievable.rmse_mm > 0.9 * result.rmse_mm
-        assert result.best_achievable.rmse_mm <= result.rmse_mm
+        assert result.best_achievable.rmse_mm > 0.9 * result.open_rmse_mm
+        assert result.best_achievable.rmse_mm <= result.open_rmse_mm
 
 
-@pytest.mark.parametrize("hidden", ["creep", "leak"])
-def test_compare_and_diagnose_give_one_floor_and_one_best_achievable_error(hidden):
-    """On the same rows; no error of the ranking, and none with the named effects, is below it."""
-    rig = VirtualRig(0, take=3, hidden=((hidden, 1.5),))
-    made, _ = rig.record(make_protocol("mixed", rig.limits, 6000, seed=3))
+def bench(hidden: str, seed: int, points: int = 4000):
+    """A recording of the virtual rig with one hidden effect."""
+    rig = VirtualRig(0, take=seed, hidden=((hidden, 1.5),))
+    made, _ = rig.record(make_protocol("mixed", rig.limits, points, seed=seed))
+    return made
+
+
+def gated(rows: int):
+    """A recording in one run, without holds, that states no noise."""
+    pressure = walk(rows)
+    effect = 0.3 * (pressure[:, 0] - relaxation(pressure[:, 0], 9.0))
+    return recording(effect, pressure, noise_mm=None)
+
+
+@pytest.mark.parametrize(
+    ("model", "recorded", "source"),
+    [
+        ("default", lambda: [bench("creep", 3)], "sidecar"),
+        ("default", lambda: [bench("leak", 3)], "sidecar"),
+        ("default", lambda: [bench("payload", 5, 2500), bench("payload", 6, 2000)], "sidecar"),
+        ("default", lambda: [replace(bench("hysteresis", 7, 6000), noise_mm=None)], "holds"),
+        (None, lambda: [gated(ROWS)], "second differences"),
+    ],
+    ids=["creep", "leak", "two recordings", "noise from holds", "second differences"],
+)
+def test_compare_and_diagnose_give_one_floor_and_one_best_achievable_error(model, recorded, source):
+    """As both commands are called; nothing that is reported is below it, and the share fits it."""
+    model, made = still_model() if model is None else load_model(model), recorded()
+    found = diagnose(model, made)
+    result, table = compare(model, made)
+    best = found.error_mm.best_achievable
+    assert result.best_achievable.rmse_mm == best
+    assert result.floor.rmse_mm == pytest.approx(found.error_mm.floor, rel=1e-12)
+    assert result.floor.source == source
+    assert result.open_rmse_mm == found.error_mm.before
+    assert table.floor == result.floor
+    floor, before = found.error_mm.floor, found.error_mm.before
+    assert best <= before
+    share = (before**2 - best**2) / (before**2 - floor**2)
+    assert result.explainable == pytest.approx(min(share, 1.0))
+    assert all(row.heldout_rmse_mm >= best for row in found.ranking)
+    remains = re.search(r"([0-9.]+) mm remain|leave about ([0-9.]+) mm", found.verdict.sentence)
+    if remains:
+        assert float(next(filter(None, remains.groups()))) >= float(f"{best:.3g}")
+    # The error itself is that over all rows.
+    assert result.samples == sum(each.samples for each in made)
+    assert result.rmse_mm == pytest.approx(np.sqrt(np.nanmean(np.square(table.error_mm))))
+    assert f"error {result.open_rmse_mm:.2f} mm, best achievable" in result.sentence
+
+
+def test_rows_that_diagnose_does_not_see_do_not_change_the_best_achievable_error():
+    """Held-out rows are off by 5 mm: the error says so; floor, best error and share stay."""
+    made = bench("creep", 3)
+    points = made.key_points_mm.copy()
+    points[held_out_rows([made])] += 5.0
     model = load_model("default")
-    found = diagnose(model, [made])
-    result, _ = compare(model, [made], part="training")
-    assert result.floor.rmse_mm == found.error_mm.floor
-    assert result.best_achievable.rmse_mm == found.error_mm.best_achievable
-    assert result.rmse_mm == pytest.approx(found.error_mm.before, rel=0.01)
-    assert all(row.heldout_rmse_mm >= found.error_mm.best_achievable for row in found.ranking)
-    assert found.error_mm.best_achievable <= found.error_mm.before
+    plain, _ = compare(model, [made])
+    off, _ = compare(model, [replace(made, key_points_mm=points)])
+    assert off.rmse_mm > 3 * plain.rmse_mm
+    assert off.open_rmse_mm == plain.open_rmse_mm
+    assert off.best_achievable == plain.best_achievable
+    assert off.explainable == plain.explainable
+    assert off.floor == plain.floor
+
+
+def test_one_part_is_judged_on_its_own_rows():
+    """The held-out rows alone have their own best achievable error, below their own error."""
+    result, _ = compare(load_model("default"), [bench("creep", 3)], part="held_out")
+    assert result.open_rmse_mm == pytest.approx(result.rmse_mm, rel=0.02)
+    assert result.best_achievable.rmse_mm < result.open_rmse_mm
+    assert "rows that diagnose uses" not in result.sentence

@@ -43,9 +43,11 @@ HOW = (
     "alone removes. Shares overlap, so they do not add up to 100 %.\n\n"
     "The best achievable error is the least that anything left on blocks of time that it was not "
     "fitted to: a black box (a regression on the actuation and its past, without physics), each "
-    "known effect and the selected effects. `surgisoft diagnose` reports the same number on the "
-    "same rows. What lies between it and the noise floor may be noise, or more than could be "
-    "learned from these recordings."
+    "known effect and the selected effects. It and the noise floor are those that `surgisoft "
+    "diagnose` reports, which uses the first three quarters of each recording (of four or more "
+    "runs, all but the last quarter of them). The explainable share is that of the error on these "
+    "rows; all other numbers are of all rows. What lies between the best achievable error and the "
+    "noise floor may be noise, or more than could be learned from these recordings."
 )
 PICTURES = {
     "loops": "Tip against actuation, measured and predicted; below, without what pressure explains",
@@ -116,6 +118,7 @@ def _facts(result: Comparison) -> Facts:
         (f"noise floor ({result.floor.source})", _mm(result.floor.rmse_mm)),
     ]
     if result.best_achievable is not None:
+        items.append(("error on the rows that diagnose uses", _mm(result.open_rmse_mm)))
         items.append(("best achievable error", _mm(result.best_achievable.rmse_mm)))
     if result.explainable is not None:
         items.append(("explainable", f"{100 * result.explainable:.0f} %"))

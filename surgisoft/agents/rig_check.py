@@ -1,13 +1,26 @@
-"""Check of an exported controller: one episode on the virtual rig, beside that of `evaluate`.
+"""Checks of an exported controller on the virtual rig, over one whole episode, beside `evaluate`.
 
-The same robot, with the same history, is driven twice: by the policy inside this package, as
-`evaluate --on rig` does, and by the controller from samples alone.
+Same measurements: the policy drives a robot as `evaluate --on rig` does, and the controller is
+given the samples of that episode. Both decide about the same robot at every instant, so that they
+differ by rounding alone.
+
+Closed loop: the same robot, with the same history, is driven a second time by the controller, from
+its own samples. Rounding now comes back through the robot. Arm models with a direction of pressure
+change jump where it reverses, and sensors read in steps, so that a policy may rest beside a
+reversal at an unstable equilibrium: what differs grows there from decision to decision, until two
+courses of the same policy are as far apart as two courses can be. Therefore, where the loops
+differ, the policy is also compared with itself after its first command was `NUDGE_KPA` higher;
+where that does not show it, with every command moved at random by as much as the controller's
+differ given the same measurements. What the policy then differs from itself by, no controller can
+stay below that computes with rounded numbers.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from typing import cast
 
 import numpy as np
@@ -19,26 +32,82 @@ from surgisoft.agents.policies import Policy
 from surgisoft.agents.rollout import Instant, rollout
 from surgisoft.errors import InputError
 from surgisoft.rig import SimulatedRig
-from surgisoft.rig.interface import is_simulated
+from surgisoft.rig.interface import Sample, Truth, is_simulated
 from surgisoft.tasks.base import Signal, Task, TaskState
+
+TOLERANCE_MM = 1e-4
+"""Largest accepted difference of a coordinate, estimated or true, mm."""
+TOLERANCE_KPA = 5e-4
+"""Largest accepted difference of a command, kPa. Key points of 100 mm in single precision are
+8e-6 mm apart; the direction of a tip, and the policy, make 2e-4 kPa of that. A reading of the
+virtual rig's pressure sensors has steps of 0.02 kPa."""
+NUDGE_KPA = 1e-6
+"""By how much the first command is moved to see what the loop makes of rounding, kPa. Neighbouring
+numbers of single precision are 2e-6 kPa apart at 20 kPa, 4e-6 kPa from 32 kPa."""
+EXPLAINS = 10.0
+"""A difference up to this many times that of the policy from itself is rounding, no unit."""
+
+
+@dataclass(frozen=True)
+class Differences:
+    """Largest differences over an episode."""
+
+    points_mm: float
+    """Of any coordinate of a key point at any decision, mm."""
+    commands_kPa: float
+    """Of any command, kPa."""
+
+    @property
+    def accepted(self) -> bool:
+        """Whether both are within `TOLERANCE_MM` and `TOLERANCE_KPA`."""
+        return self.points_mm <= TOLERANCE_MM and self.commands_kPa <= TOLERANCE_KPA
+
+    def explains(self, other: Differences) -> bool:
+        """Whether a policy that differs from itself by this much explains another difference."""
+        most_mm = max(TOLERANCE_MM, EXPLAINS * self.points_mm)
+        most_kPa = max(TOLERANCE_KPA, EXPLAINS * self.commands_kPa)
+        return other.points_mm <= most_mm and other.commands_kPa <= most_kPa
 
 
 @dataclass(frozen=True)
 class RigCheck:
-    """How far two closed loops on one robot lie apart."""
+    """How far a controller and its policy differ in one episode."""
 
-    points_mm: float
-    """Largest distance of any coordinate of a true key point at any decision, mm."""
-    commands_kPa: float
-    """Largest difference of any command, kPa."""
+    same: Differences
+    """Given the same measurements: commands, and estimated key points."""
+    closed: Differences
+    """Each in its own closed loop on the same robot: commands, and true key points."""
     decisions: int
     """Decisions of the episode, without the first."""
+    nudged: Differences | None = None
+    """The policy and itself, of which commands were moved: as `closed`; None where `closed` is
+    accepted."""
+    moved_kPa: float | None = None
+    """Up to how much every command was moved at random for `nudged`, kPa; None: the first one was
+    moved by `NUDGE_KPA`."""
+
+    @property
+    def amplified(self) -> bool:
+        """Whether the closed loops differ by rounding that the loop amplifies, as `nudged` does."""
+        return self.nudged is not None and self.nudged.explains(self.closed)
+
+    @property
+    def passed(self) -> bool:
+        """Whether the controller does what the policy does."""
+        return self.same.accepted and (self.closed.accepted or self.amplified)
 
 
 class _LoggedRig:
-    """A simulated rig that keeps its commands; it has the methods and attributes of the rig."""
+    """A simulated rig that keeps commands and samples; it has the methods of the rig."""
 
-    def __init__(self, build: BuildRig, config: RigConfig, trial: int):
+    def __init__(
+        self,
+        build: BuildRig,
+        nudges: Mapping[int, float],
+        config: RigConfig,
+        trial: int,
+    ):
+        """nudges: number of a command -> by how much the rig is commanded more, kPa."""
         rig = build(config, trial)
         if not is_simulated(rig):
             raise InputError(
@@ -46,15 +115,167 @@ class _LoggedRig:
                 "expected a simulated rig"
             )
         self.rig: SimulatedRig = rig
-        self.made = (config, trial)
+        self.made, self.nudges = (config, trial), nudges
         self.commands: list[np.ndarray] = []
+        self.samples: list[tuple[np.ndarray, np.ndarray]] = []
 
     def __getattr__(self, name: str):
         return getattr(self.rig, name)
 
     def command(self, pressures: np.ndarray) -> None:
+        more_kPa = self.nudges.get(len(self.commands), 0.0)
         self.commands.append(np.array(pressures))
-        self.rig.command(pressures)
+        self.rig.command(np.clip(pressures + more_kPa, *self.rig.limits.T))
+
+    def read_beside_truth(self) -> tuple[Sample, Truth]:
+        sample, truth = self.rig.read_beside_truth()
+        self.samples.append((np.array(sample.measured), np.array(sample.key_points_mm)))
+        return sample, truth
+
+
+@dataclass(frozen=True, eq=False)
+class DrivenEpisode:
+    """Episode 0 of a seed as a policy drove it on virtual rigs, with all that was measured."""
+
+    task: Task
+    """The simulated task of the policy."""
+    states: list[TaskState]
+    """The state at the start and at every decision."""
+    rigs: dict[str, _LoggedRig]
+    """Arm -> its rig with its commands and samples."""
+
+    @property
+    def decisions(self) -> int:
+        """Decisions without the first."""
+        return len(self.states) - 1
+
+    @property
+    def period_s(self) -> float:
+        """Time between two samples, s."""
+        return next(iter(self.rigs.values())).period_s
+
+    @property
+    def samples(self) -> int:
+        """Samples between two decisions."""
+        return round(self.task.world.config.dt_s / self.period_s)
+
+    @property
+    def settled(self) -> int:
+        """Samples before the episode began, while the arm was brought to its start."""
+        return len(next(iter(self.rigs.values())).commands) - self.samples * self.decisions
+
+    def signals(self, decision: int) -> dict[str, float]:
+        """The task's signals at a decision as they are in simulation; 0 is the first one."""
+        before = self.states[decision - 1] if decision else None
+        signals: tuple[Signal, ...] = getattr(self.task, "signals", ())
+        after = self.states[decision]
+        return {each.name: float(each.true(self.task, before, after)[0]) for each in signals}
+
+    def commanded(self, row: int) -> dict[str, np.ndarray]:
+        """Arm -> pressures (m,) kPa that were in force up to a sample."""
+        return {name: rig.commands[row] for name, rig in self.rigs.items()}
+
+    def measured(self, row: int) -> tuple[dict, dict]:
+        """Pressures and key points of a sample, by arm."""
+        pressures, points = (
+            {name: rig.samples[row][each] for name, rig in self.rigs.items()} for each in range(2)
+        )
+        return pressures, points
+
+
+def drive(
+    task: Task,
+    policy: Policy,
+    config: RigConfig | None = None,
+    seed: int = 0,
+    build: BuildRig = named_rig,
+    nudges: Mapping[int, float] | None = None,
+) -> DrivenEpisode:
+    """Episode 0 of a seed on virtual rigs, driven by a policy as `evaluate --on rig` does.
+
+    nudges: number of a command since the rigs were made -> by how much every rig is then commanded
+    more than the policy asks for, kPa.
+    """
+    moved = on_rig(task, config or RigConfig(), partial(_LoggedRig, build, nudges or {}))
+    states: list[TaskState] = []
+
+    def keep(instant: Instant) -> None:
+        states.append(instant.state)
+
+    rollout(moved, policy, 1, seed, watch=keep)
+    rigs = {name: part.plant.rigs.items[0] for name, part in states[0].world.arms.items()}
+    return DrivenEpisode(task, states, rigs)
+
+
+def same_measurements(
+    controller: Controller, episode: DrivenEpisode, most: int | None = None
+) -> Differences:
+    """Differences of a controller that is given the samples and set points of a driven episode.
+
+    most: number of decisions after which it ends; None: the whole episode.
+    """
+    first = _prepared(controller, episode)
+    for row in range(episode.settled - 1):
+        asked = episode.commanded(row)
+        controller.observe(*episode.measured(row), asked, episode.period_s, **first)
+    asked = episode.commanded(episode.settled - 1)
+    start = episode.measured(episode.settled - 1)
+    command = _begun(controller, episode, start, asked)
+    points, commands = [0.0], [0.0]
+    for decision, rows in islice(_decisions(episode), most):
+        signals = episode.signals(decision)
+        for row in rows:
+            asked = episode.commanded(row)
+            commands.append(_apart(command, asked, episode))
+            command = controller.step(*episode.measured(row), episode.period_s, asked, **signals)
+        for name, part in episode.states[decision].world.arms.items():
+            off = controller.outputs[f"{name}_estimate_mm"] - part.seen_mm[0].numpy()
+            points.append(float(np.abs(off).max()))
+    return Differences(float(np.max(points)), float(np.max(commands)))
+
+
+def closed_loop(
+    controller: Controller, episode: DrivenEpisode, build: BuildRig = named_rig
+) -> Differences:
+    """Differences of a controller that drives the robot of an episode from its own samples.
+
+    What a task observes of its scene is given to the controller as it was in the episode.
+    """
+    rigs = {name: cast(SimulatedRig, build(*rig.made)) for name, rig in episode.rigs.items()}
+    for rig in rigs.values():
+        rig.reset()
+    first = _prepared(controller, episode)
+    for row in range(episode.settled):
+        asked = episode.commanded(row)
+        measured = _measured(rigs, asked)
+        if row < episode.settled - 1:
+            controller.observe(*measured[:2], asked, episode.period_s, **first)
+    command = _begun(controller, episode, measured[:2], asked)
+    points, commands = [0.0], [0.0]
+    for decision, rows in _decisions(episode):
+        signals = episode.signals(decision)
+        for row in rows:
+            commands.append(_apart(command, episode.commanded(row), episode))
+            measured = _measured(rigs, _by_arm(command, rigs))
+            command = controller.step(*measured[:2], episode.period_s, **signals)
+        for name, part in episode.states[decision].world.arms.items():
+            pose = part.mount[0].double().numpy()
+            true = measured[2][name] @ pose[:3, :3].T + pose[:3, 3]
+            points.append(float(np.abs(true - part.points_mm[0].numpy()).max()))
+    return Differences(float(np.max(points)), float(np.max(commands)))
+
+
+def apart(one: DrivenEpisode, other: DrivenEpisode) -> Differences:
+    """Differences of two driven episodes, as far as the shorter one goes."""
+    points, commands = [0.0], [0.0]
+    for before, after in zip(one.states, other.states, strict=False):
+        for name, part in before.world.arms.items():
+            off = part.points_mm - after.world.arms[name].points_mm
+            points.append(float(off.abs().max()))
+    for name, rig in one.rigs.items():
+        for asked, also in zip(rig.commands, other.rigs[name].commands, strict=False):
+            commands.append(float(np.abs(asked - also).max()))
+    return Differences(float(np.max(points)), float(np.max(commands)))
 
 
 def check_on_rig(
@@ -67,77 +288,69 @@ def check_on_rig(
 ) -> RigCheck:
     """Compare a controller with its policy in episode 0 of a seed, on virtual rigs.
 
-    task: the simulated task of the policy. What a task observes of its scene is given to the
-    controller as it was in the episode of the policy.
+    task: the simulated task of the policy.
     """
-    config = config or RigConfig()
-    moved = on_rig(task, config, partial(_LoggedRig, build))
-    states: list[TaskState] = []
+    episode = drive(task, policy, config, seed, build)
+    same = same_measurements(controller, episode)
+    closed = closed_loop(controller, episode, build)
+    if closed.accepted:
+        return RigCheck(same, closed, episode.decisions)
+    nudges = {episode.settled: NUDGE_KPA}
+    nudged = apart(episode, drive(task, policy, config, seed, build, nudges))
+    if nudged.explains(closed) or not same.accepted:
+        return RigCheck(same, closed, episode.decisions, nudged)
+    most_kPa = max(NUDGE_KPA, same.commands_kPa)
+    rows = range(episode.settled, episode.settled + episode.samples * task.steps)
+    moved = np.random.default_rng(0).uniform(-most_kPa, most_kPa, len(rows)).tolist()
+    nudges = dict(zip(rows, moved, strict=True))
+    nudged = apart(episode, drive(task, policy, config, seed, build, nudges))
+    return RigCheck(same, closed, episode.decisions, nudged, most_kPa)
 
-    def keep(instant: Instant) -> None:
-        states.append(instant.state)
 
-    rollout(moved, policy, 1, seed, watch=keep)
-    first, decisions = states[0], len(states) - 1
-    logged = {name: part.plant.rigs.items[0] for name, part in first.world.arms.items()}
-    rigs = {name: cast(SimulatedRig, build(*rig.made)) for name, rig in logged.items()}
+def _prepared(controller: Controller, episode: DrivenEpisode) -> dict[str, float]:
+    """Reset the controller, set limits and mounts of an episode; the signals at its start."""
     controller.reset()
-    _as_started(controller, first, rigs)
-    period_s = next(iter(rigs.values())).period_s
-    samples = round(task.world.config.dt_s / period_s)
-    settled = len(next(iter(logged.values())).commands) - samples * decisions
-    for rig in rigs.values():
-        rig.reset()
-    signals = _signals(task, None, first)
-    for number in range(settled):
-        asked = {name: rig.commands[number] for name, rig in logged.items()}
-        measured = _measured(rigs, asked)
-        if number < settled - 1:
-            controller.observe(measured[0], measured[1], asked, period_s, **signals)
-    goal = {
-        name.removeprefix("goal."): value[0].numpy()
-        for name, value in named_tensors(first.goal, "goal")
-    }
-    if first.world.scene.lesion is not None:
-        goal["lesion"] = first.world.scene.lesion[0].numpy()
-    command = controller.begin(measured[0], measured[1], asked, period_s, goal=goal, **signals)
-    points, commands = 0.0, 0.0
-    for decision in range(decisions):
-        before, after = states[decision], states[decision + 1]
-        signals = _signals(task, before, after)
-        for sample in range(samples):
-            asked = _by_arm(command, rigs)
-            row = settled + decision * samples + sample
-            for name, rig in logged.items():
-                gap = np.abs(np.clip(asked[name], *rig.limits.T) - rig.commands[row]).max()
-                commands = max(commands, float(gap))
-            measured = _measured(rigs, asked)
-            command = controller.step(measured[0], measured[1], period_s, **signals)
-        for name, part in after.world.arms.items():
-            pose = part.mount[0].double().numpy()
-            true = measured[2][name] @ pose[:3, :3].T + pose[:3, 3]
-            points = max(points, float(np.abs(true - part.points_mm[0].numpy()).max()))
-    return RigCheck(points, commands, decisions)
-
-
-def _as_started(controller: Controller, first: TaskState, rigs: dict[str, SimulatedRig]) -> None:
-    """Set limits and mounts of the episode in the controller's state."""
+    first, rigs = episode.states[0], episode.rigs
     low, high = ({name: rig.limits[:, end] for name, rig in rigs.items()} for end in (0, 1))
     controller.limit(low, high)
     if first.world.out_mm is not None:
         controller.set(out_mm=first.world.out_mm[0].numpy())
     for name, part in first.world.arms.items():
         controller.set(**{f"arms__{name}__mount": part.mount[0].numpy()})
+    return episode.signals(0)
 
 
-def _signals(task: Task, before: TaskState | None, after: TaskState) -> dict[str, float]:
-    """The task's signals as they are in simulation."""
-    signals: tuple[Signal, ...] = getattr(task, "signals", ())
-    return {each.name: float(each.true(task, before, after)[0]) for each in signals}
+def _begun(controller: Controller, episode: DrivenEpisode, measured: tuple, asked: dict):
+    """Begin with a sample and the goal of an episode; the pressures to command, kPa."""
+    first = episode.states[0]
+    goal = {
+        name.removeprefix("goal."): value[0].numpy()
+        for name, value in named_tensors(first.goal, "goal")
+    }
+    if first.world.scene.lesion is not None:
+        goal["lesion"] = first.world.scene.lesion[0].numpy()
+    return controller.begin(*measured, asked, episode.period_s, goal=goal, **episode.signals(0))
 
 
-def _by_arm(command, rigs: dict) -> dict[str, np.ndarray]:
-    return command if isinstance(command, dict) else dict.fromkeys(rigs, command)
+def _decisions(episode: DrivenEpisode) -> Iterator[tuple[int, range]]:
+    """Number of each decision after the first, and the samples up to it."""
+    for number in range(episode.decisions):
+        row = episode.settled + number * episode.samples
+        yield number + 1, range(row, row + episode.samples)
+
+
+def _apart(command, asked: dict[str, np.ndarray], episode: DrivenEpisode) -> float:
+    """Largest difference of a controller's command from what a policy asked for, kPa."""
+    given = _by_arm(command, asked)
+    off = [
+        np.abs(np.clip(given[name], *rig.limits.T) - asked[name]).max()
+        for name, rig in episode.rigs.items()
+    ]
+    return float(np.max(off))
+
+
+def _by_arm(command, arms: dict) -> dict[str, np.ndarray]:
+    return command if isinstance(command, dict) else dict.fromkeys(arms, command)
 
 
 def _measured(rigs: dict[str, SimulatedRig], asked: dict[str, np.ndarray]) -> tuple[dict, ...]:

@@ -1,7 +1,7 @@
 """`surgisoft export`: policies and arm models as files for other programs."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,6 +11,12 @@ from surgisoft.cli.options import EffectFiles
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
 from surgisoft.files import read_json
+
+if TYPE_CHECKING:
+    from surgisoft.agents.rig_check import RigCheck
+
+DIFFERS = 1
+"""Exit code where an exported controller does not do what its policy does."""
 
 
 @app.command()
@@ -30,8 +36,9 @@ def export(
         bool,
         typer.Option(
             "--check",
-            help="Drive a virtual rig for one episode with the exported controller of a run, "
-            "beside the policy itself, and print the largest difference.",
+            help="Drive a virtual rig for one episode with the policy of a run, and print how far "
+            "the exported controller differs from it, given the same measurements and in its own "
+            "closed loop. Exit code 1 where that is more than rounding.",
         ),
     ] = False,
     data: Annotated[
@@ -60,12 +67,15 @@ def export(
         raise InputError(f"{source}: is an arm model; --which and --check are for training runs")
     if data and not is_model:
         raise InputError(f"{source}: is a training run; --data is for arm models, see --check")
+    passed = True
     if is_model:
         files = _model(source, output, data)
     else:
-        files = _run(source, output, which or "best", check)
+        files, passed = _run(source, output, which or "best", check)
     for file in files:
         print(f"wrote {file}")
+    if not passed:
+        raise typer.Exit(DIFFERS)
 
 
 def _model(source: Path, output: Path, data: list[Path] | None) -> list[Path]:
@@ -83,7 +93,8 @@ def _model(source: Path, output: Path, data: list[Path] | None) -> list[Path]:
     return files
 
 
-def _run(source: Path, output: Path, which: str, check: bool) -> list[Path]:
+def _run(source: Path, output: Path, which: str, check: bool) -> tuple[list[Path], bool]:
+    """The files, and whether the controller passed its check, where one was asked for."""
     from surgisoft.agents.controller_runner import Controller
     from surgisoft.agents.export import export as export_policy
     from surgisoft.agents.learned import LearnedPolicy
@@ -99,8 +110,38 @@ def _run(source: Path, output: Path, which: str, check: bool) -> list[Path]:
     elif check:
         with progress("one episode on the virtual rig"):
             found = check_on_rig(Controller(output), task, policy)
-        print(
-            f"on the virtual rig, {found.decisions} decisions: exported controller and policy "
-            f"differ by {found.points_mm:.2g} mm and {found.commands_kPa:.2g} kPa at most"
+        for line in _compared(found):
+            print(line)
+        return files, found.passed
+    return files, True
+
+
+def _compared(found: "RigCheck") -> list[str]:
+    """What is printed of a comparison on the virtual rig."""
+    from surgisoft.agents.rig_check import NUDGE_KPA, TOLERANCE_KPA, TOLERANCE_MM
+
+    same, closed, nudged = found.same, found.closed, found.nudged
+    lines = [
+        f"on the virtual rig, {found.decisions} decisions: largest differences of exported "
+        "controller and policy",
+        f"same measurements: commands {same.commands_kPa:.2g} kPa, estimated key points "
+        f"{same.points_mm:.2g} mm ({TOLERANCE_KPA:g} kPa and {TOLERANCE_MM:g} mm are accepted)",
+        f"closed loop: commands {closed.commands_kPa:.2g} kPa, true key points "
+        f"{closed.points_mm:.2g} mm",
+    ]
+    if not same.accepted:
+        lines.append("the exported controller does not compute what the policy computes")
+    elif nudged is not None:
+        how = f"its first command moved by {NUDGE_KPA:g} kPa"
+        if found.moved_kPa is not None:
+            how = f"every command moved at random by up to {found.moved_kPa:.2g} kPa"
+        lines.append(
+            f"the policy beside itself, {how}: commands {nudged.commands_kPa:.2g} kPa, true key "
+            f"points {nudged.points_mm:.2g} mm"
         )
-    return files
+        lines.append(
+            "the loop amplifies rounding: the policy differs as much from itself"
+            if found.amplified
+            else "the exported controller does in the loop what the policy does not do"
+        )
+    return lines

@@ -18,12 +18,25 @@ from surgisoft.agents.controller_runner import Controller
 from surgisoft.agents.distributed import Processes
 from surgisoft.agents.export import export, running
 from surgisoft.agents.learned import ActorPolicy, LearnedPolicy, agent_sizes
+from surgisoft.agents.observer import ObserverGains
 from surgisoft.agents.on_rig import RigConfig
 from surgisoft.agents.presets import Plan, Preset
-from surgisoft.agents.rig_check import check_on_rig
+from surgisoft.agents.rig_check import (
+    NUDGE_KPA,
+    TOLERANCE_KPA,
+    TOLERANCE_MM,
+    Differences,
+    RigCheck,
+    apart,
+    check_on_rig,
+    drive,
+    same_measurements,
+)
 from surgisoft.agents.training import train_new
 from surgisoft.cli import run as surgisoft
 from surgisoft.errors import InputError
+from surgisoft.rig.motion_capture import CameraDesign
+from surgisoft.rig.virtual import VirtualRig
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.registry import TASKS, config_of, make_task, with_fields
 
@@ -114,8 +127,10 @@ def test_the_exported_controller_does_on_the_rig_what_evaluate_does(engine, poli
     """To 1e-4 mm, on a robot that the model does not know, from measurements alone."""
     found = check_on_rig(Controller(exported, engine), policy.run.task(), policy, STRANGE, seed=4)
     assert found.decisions == 25
-    assert found.points_mm < AGREE_MM
-    assert found.commands_kPa < AGREE_KPA
+    assert found.closed.points_mm < AGREE_MM
+    assert found.closed.commands_kPa < AGREE_KPA
+    assert found.same.accepted
+    assert found.passed
 
 
 @pytest.mark.parametrize("name", SHORT)
@@ -130,8 +145,10 @@ def test_the_controller_of_every_task_does_on_the_rig_what_evaluate_does(name):
     controller = running(ControllerGraph(task, actors))
     found = check_on_rig(controller, task, ActorPolicy(actors), STRANGE, seed=3)
     assert found.decisions == 25
-    assert found.points_mm < AGREE_MM
-    assert found.commands_kPa < AGREE_KPA
+    assert found.closed.points_mm < AGREE_MM
+    assert found.closed.commands_kPa < AGREE_KPA
+    assert found.same.accepted
+    assert found.passed
 
 
 def test_every_task_has_a_controller():
@@ -144,7 +161,73 @@ def test_the_check_sees_a_wrong_observer(policy):
     task = policy.run.task()
     other = replace(STRANGE, observer_gain=0.9)
     found = check_on_rig(running(ControllerGraph(task, policy.actors)), task, policy, other)
-    assert found.points_mm > 1e-3
+    assert found.closed.points_mm > 1e-3
+    assert not found.same.accepted
+    assert not found.passed
+
+
+def ten_pictures_a_second(config, trial):
+    """A rig with one sample for each decision, which takes half the time."""
+    cameras = CameraDesign(rate_Hz=10.0)
+    return VirtualRig(config.seed, noise=config.noise, take=trial, cameras=cameras)
+
+
+@pytest.fixture(scope="module")
+def ring():
+    """The packaged policy, its task, and a whole episode of it with noise on another robot."""
+    policy = LearnedPolicy("ring")
+    task = policy.run.task()
+    config = replace(STRANGE, noise=1.0)
+    return policy, task, drive(task, policy, config, build=ten_pictures_a_second)
+
+
+def test_over_a_whole_episode_the_same_measurements_give_the_same_commands(ring):
+    """A ring is cut in 400 decisions and more, with noise: the loops would be far apart by then."""
+    policy, task, episode = ring
+    assert episode.decisions > 400
+    found = same_measurements(running(ControllerGraph(task, policy.actors)), episode)
+    assert 0.0 < found.points_mm < AGREE_MM
+    assert 0.0 < found.commands_kPa < AGREE_KPA
+
+
+@pytest.mark.parametrize("wrong", ["pumps", "transients"])
+def test_a_wrong_constant_of_the_controller_shows_in_the_same_measurements(ring, wrong):
+    """A gain of 0.4 in place of 0.3; decays that are 0.9998 of themselves."""
+    policy, task, episode = ring
+    gains = ObserverGains(pump_gain=0.4 if wrong == "pumps" else 0.3)
+    graph = ControllerGraph(task, policy.actors, gains)
+    for arm in graph.arms.values():
+        if wrong == "transients":
+            arm.observer.learner.keep = 0.9998 * arm.observer.learner.keep
+    found = same_measurements(running(graph), episode, most=60)
+    assert not found.accepted
+
+
+def test_a_loop_that_amplifies_rounding_is_told_from_a_wrong_controller():
+    """What the policy differs from itself by explains ten times as much, and nothing else does."""
+    right, far = Differences(TOLERANCE_MM, TOLERANCE_KPA), Differences(0.35, 1.1)
+    assert RigCheck(right, right, 456).passed
+    for itself, explained in ((Differences(0.04, 0.2), True), (Differences(0.03, 0.2), False)):
+        found = RigCheck(right, far, 456, itself)
+        assert found.amplified == found.passed == explained
+    assert not RigCheck(right, far, 456, Differences(0.04, 0.1)).passed
+    assert not RigCheck(right, Differences(np.nan, 0.0), 456, Differences(1.0, 1.0)).passed
+    assert not RigCheck(right, far, 456).passed
+    for wrong in (Differences(1.1e-4, 0.0), Differences(0.0, 6e-4), Differences(0.0, np.nan)):
+        found = RigCheck(wrong, far, 456, Differences(0.3, 1.0))
+        assert found.amplified
+        assert not found.passed
+
+
+def test_the_policy_itself_departs_after_one_command_was_rounded_otherwise(ring):
+    """One set point of 10^-6 kPa more: after a whole ring the endoscope is 0.02 mm away or more."""
+    policy, task, episode = ring
+    config = replace(STRANGE, noise=1.0)
+    nudges = {episode.settled: NUDGE_KPA}
+    moved = drive(task, policy, config, build=ten_pictures_a_second, nudges=nudges)
+    found = apart(episode, moved)
+    assert found.points_mm > 200.0 * TOLERANCE_MM
+    assert found.explains(Differences(0.1, 0.1))
 
 
 def test_policy_json_names_every_entry_of_the_observation(policy, exported):

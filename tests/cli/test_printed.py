@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from surgisoft.agents.rig_check import Differences, RigCheck
 from surgisoft.cli import run
 from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Ranked, Verdict
 from surgisoft.errors import InputError
@@ -659,13 +660,22 @@ def test_an_export_without_a_controller_says_why(tmp_path, capsys, monkeypatch):
     assert out.endswith(f"wrote {tmp_path / 'policy.onnx'}\n")
     (tmp_path / "controller.py").touch()
     monkeypatch.setattr("surgisoft.agents.controller_runner.Controller", lambda folder: None)
-    check = SimpleNamespace(decisions=30, points_mm=0.00123, commands_kPa=0.5)
-    monkeypatch.setattr("surgisoft.agents.rig_check.check_on_rig", lambda *_: check)
-    assert run(["export", "runs/x", "-o", str(tmp_path), "--check"]) == 0
-    assert (
-        "on the virtual rig, 30 decisions: exported controller and policy differ by 0.0012 mm"
-        in (capsys.readouterr().out)
-    )
+    right, far = Differences(1.5e-5, 0.00013), Differences(0.35, 1.1)
+    itself = Differences(0.29, 1.4)
+    for check, code, told in (
+        (RigCheck(right, Differences(3e-5, 9e-5), 30), 0, "true key points 3e-05 mm\nwrote"),
+        (RigCheck(right, far, 456, itself), 0, "the policy differs as much from itself\nwrote"),
+        (RigCheck(right, far, 456, itself, 0.00013), 0, "moved at random by up to 0.00013 kPa: "),
+        (RigCheck(right, far, 456, right, 0.00013), 1, "what the policy does not do\nwrote"),
+        (RigCheck(far, far, 456, itself), 1, "does not compute what the policy computes\nwrote"),
+    ):
+        monkeypatch.setattr("surgisoft.agents.rig_check.check_on_rig", lambda *_, it=check: it)
+        assert run(["export", "runs/x", "-o", str(tmp_path), "--check"]) == code
+        out = capsys.readouterr().out
+        assert f"same measurements: commands {check.same.commands_kPa:.2g} kPa, estimated" in out
+        assert f"closed loop: commands {check.closed.commands_kPa:.2g} kPa, true key" in out
+        assert told in out
+    assert out.endswith(f"wrote {tmp_path / 'policy.onnx'}\n")
 
 
 def test_an_interrupted_recording_says_where_its_log_is(tmp_path, capsys, monkeypatch):

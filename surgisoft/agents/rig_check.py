@@ -320,7 +320,9 @@ def _prepared(controller: Controller, episode: DrivenEpisode) -> dict[str, float
     return episode.signals(0)
 
 
-def _begun(controller: Controller, episode: DrivenEpisode, measured: tuple, asked: dict):
+def _begun(
+    controller: Controller, episode: DrivenEpisode, measured: tuple[dict, dict], asked: dict
+):
     """Begin with a sample and the goal of an episode; the pressures to command, kPa."""
     first = episode.states[0]
     goal = {
@@ -353,7 +355,9 @@ def _by_arm(command, arms: dict) -> dict[str, np.ndarray]:
     return command if isinstance(command, dict) else dict.fromkeys(arms, command)
 
 
-def _measured(rigs: dict[str, SimulatedRig], asked: dict[str, np.ndarray]) -> tuple[dict, ...]:
+def _measured(
+    rigs: dict[str, SimulatedRig], asked: dict[str, np.ndarray]
+) -> tuple[dict, dict, dict]:
     """Pressures, key points and true key points of the next sample, by arm."""
     rows: tuple[dict, dict, dict] = ({}, {}, {})
     for name, rig in rigs.items():

@@ -243,6 +243,23 @@ def _decoder(path: Path, channel: Any, schema: Any) -> Any:
     return found
 
 
+def ros2_decoder(encoding: str, kind: str, definition: str) -> Callable[[bytes], Any] | None:
+    """The function that decodes messages of a type of ROS 2; None for an encoding but `cdr`.
+
+    definition: of the type, and of those that it is made of, as `.msg` files have them.
+    """
+    try:
+        from mcap.records import Schema
+        from mcap_ros2.decoder import DecoderFactory
+    except ImportError:
+        raise InputError(
+            "a ROS 2 bag needs the packages mcap and mcap-ros2-support, which are not installed: "
+            "pip install 'surgisoft[mcap]'"
+        ) from None
+    schema = Schema(id=1, data=definition.encode(), encoding="ros2msg", name=kind)
+    return DecoderFactory().decoder_for(encoding, schema)
+
+
 def _stamp(message: Any) -> float | None:
     """Time of a message's header [s]; None where it has none, or one that was not set."""
     header = _fields(message).get("header")

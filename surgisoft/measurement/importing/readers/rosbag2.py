@@ -16,7 +16,7 @@ from typing import Any
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.importing.raw import FileRole, RawTable, Reader
-from surgisoft.measurement.importing.readers.mcap import MessageLog, read_topics
+from surgisoft.measurement.importing.readers.mcap import MessageLog, read_topics, ros2_decoder
 
 MAGIC = b"SQLite format 3\0"
 """First bytes of a database (https://www.sqlite.org/fileformat.html)."""
@@ -102,17 +102,7 @@ def _decoder(
     path: Path, topic: str, kind: str, encoding: str, bag: sqlite3.Connection
 ) -> Callable[[bytes], Any]:
     """The function that decodes the messages of a type."""
-    try:
-        from mcap.records import Schema
-        from mcap_ros2.decoder import DecoderFactory
-    except ImportError:
-        raise InputError(
-            "a ROS 2 bag needs the packages mcap and mcap-ros2-support, which are not installed: "
-            "pip install 'surgisoft[mcap]'"
-        ) from None
-    text = _definition(path, topic, kind, bag)
-    schema = Schema(id=1, data=text.encode(), encoding=DEFINITION, name=kind)
-    found = DecoderFactory().decoder_for(encoding, schema)
+    found = ros2_decoder(encoding, kind, _definition(path, topic, kind, bag))
     if found is None:
         raise InputError(f"{path}: topic '{topic}' is encoded as {encoding}, expected ROS 2's cdr")
     return found

@@ -571,8 +571,10 @@ def find_mounts(
             beside.append("a free way for each beam")
         sentence = (
             f"each arm finds a mount, but no {who} leave{'s' * (len(mounts) > 2)} room for {room} "
-            f"({limits.clearance_mm:g} mm apart)" + " with " * bool(beside) + " and ".join(beside)
+            f"({limits.clearance_mm:g} mm apart)"
         )
+        if beside:
+            sentence += f" with {' and '.join(beside)}"
         return [], Shortfall(sentence, covered, viewed)
     return arrangements, None
 

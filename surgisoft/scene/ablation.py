@@ -18,6 +18,7 @@ import torch
 from surgisoft.compiled import compiled
 from surgisoft.errors import InputError
 from surgisoft.scene.dose_patch import HEALTHY, LESION, RING, SPACING_WAISTS, DosePatch, samples_at
+from surgisoft.threads import over_rows
 
 LIVER_WATER = 0.745
 """Mass fraction of water in liver (Woodard & White 1986, Br. J. Radiol. 59:1209, 'liver 2')."""
@@ -314,12 +315,16 @@ class AblationMap:
         of an `AblationState`.
         """
         patch, grid = self.patch, self.patch.buckets
-        beams = [t.contiguous().numpy() for t in (began, ended, direction, energy)]
+        beams = [t.contiguous().numpy() for t in (began, ended, direction, energy, ring)]
         kept = [t.numpy() for t in (dose, peak, band, area, joule)]
         samples = (patch.points_mm, patch.normals, patch.areas_mm2, self._zones, self._stations)
         place = (grid.origin_mm, grid.cell_mm, grid.shape, grid.starts)
-        which = ring.contiguous().numpy()
-        _deposit(*beams, which, self.waist_mm, self._counted, samples, place, *kept)
+        constants = (self.waist_mm, self._counted, samples, place)
+
+        def deposit(part: slice) -> None:
+            _deposit(*(a[part] for a in beams), *constants, *(a[part] for a in kept))
+
+        over_rows(len(energy), deposit)
         return dose, peak, band, area, joule
 
     def deposit_torch(self, began, ended, direction, energy, ring, dose, peak, band, area, joule):
@@ -345,15 +350,16 @@ class AblationMap:
 
     def report(self, state: AblationState) -> RingReport:
         """Progress of the cut in each environment."""
-        cut = state.peak >= self.cut_dose
         length = self._ring_mm[state.ring] / self.patch.stations
-        gap = longest_run(~cut)
-        cut_length = cut.sum(1) * length
-        burnt = (state.band_mm2 * cut).sum(1)
+        compiled = self.device.type == "cpu"
+        cut, gap, burnt = (cut_compiled if compiled else cut_torch)(
+            state.peak, state.band_mm2, self.cut_dose
+        )
+        cut_length = cut * length
         delivered = state.delivered_j.reshape(len(cut), -1).sum(1)
         beyond = (delivered - state.zone_j.sum(1)).clamp(min=0.0)
         return RingReport(
-            completion=cut.float().mean(1),
+            completion=cut / self.patch.stations,
             largest_gap_mm=gap * length,
             largest_gap_deg=gap * (360.0 / self.patch.stations),
             width_mm=torch.where(cut_length > 0.0, burnt / torch.maximum(cut_length, length), 0.0),
@@ -522,12 +528,33 @@ def sweep_fluence(
     return peak * torch.exp(-((scale**2) * across2)) * profile
 
 
+def cut_torch(
+    peak: torch.Tensor, band_mm2: torch.Tensor, cut_dose: float
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Cut stations (B,), stations of the longest gap (B,) and burnt area at the cut ones (B,) mm^2.
+
+    peak: (B, N) J/mm^2, highest dose at each station of a ring; band_mm2: (B, N) burnt there.
+    """
+    cut = peak >= cut_dose
+    return cut.sum(1), longest_run(~cut), (band_mm2 * cut).sum(1)
+
+
+def cut_compiled(
+    peak: torch.Tensor, band_mm2: torch.Tensor, cut_dose: float
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """`cut_torch` in one compiled loop, on the CPU."""
+    count = len(peak)
+    cut, gap = torch.empty((2, count), dtype=torch.int64)
+    burnt = band_mm2.new_empty(count)
+    given = [t.contiguous().numpy() for t in (peak, band_mm2)]
+    found = [t.numpy() for t in (cut, gap, burnt)]
+    dose = given[0].dtype.type(cut_dose)
+    over_rows(count, lambda rows: _cuts(*(a[rows] for a in given), dose, *(a[rows] for a in found)))
+    return cut, gap, burnt
+
+
 def longest_run(flags: torch.Tensor) -> torch.Tensor:
     """(B,) length of the longest run of True in rings (B, N): the last neighbours the first."""
-    if flags.device.type == "cpu":
-        found = torch.empty(len(flags), dtype=torch.int64)
-        _longest_runs(flags.contiguous().numpy(), found.numpy())
-        return found
     count = flags.shape[1]
     twice = torch.cat((flags, flags), 1)
     place = torch.arange(1, 2 * count + 1, device=flags.device)
@@ -536,17 +563,23 @@ def longest_run(flags: torch.Tensor) -> torch.Tensor:
 
 
 @compiled
-def _longest_runs(flags, out):
-    """Longest run of True in each ring of flags (B, N), into out (B,)."""
-    count = flags.shape[1]
-    for n in range(len(flags)):
-        longest, run = 0, 0
-        for k in range(2 * count):
-            run = run + 1 if flags[n, k if k < count else k - count] else 0
-            longest = max(longest, run)
-            if k >= count - 1 and run == 0:
-                break
-        out[n] = min(longest, count)
+def _cuts(peak, band, cut_dose, cut, gap, burnt):
+    """Cut stations, longest gap and burnt area of rings (B, N), see `cut_torch`, each into (B,)."""
+    count = peak.shape[1]
+    for n in range(len(cut)):
+        done, longest, run, first, area = 0, 0, 0, -1, np.float32(0.0)
+        for k in range(count):
+            if peak[n, k] >= cut_dose:
+                done += 1
+                area += band[n, k]
+                first = k if first < 0 else first
+                run = 0
+            else:
+                run += 1
+                longest = max(longest, run)
+        # The gap that goes on from the last station to the first.
+        cut[n], burnt[n] = done, area
+        gap[n] = max(longest, run + first) if first >= 0 else count
 
 
 def _pick(mask, fresh, old):

@@ -52,6 +52,7 @@ from surgisoft.scene.torch_queries import (
     chains_folded_torch,
     rays_to_chains_torch,
 )
+from surgisoft.threads import over_rows
 
 ENGINES = ("compiled", "torch")
 """The batched engines: compiled queries, or torch alone."""
@@ -223,30 +224,44 @@ class BatchedScene:
         shape, dtype = origins_mm.shape[:-1], origins_mm.dtype
         each, count = math.prod(shape[1:]), math.prod(shape)
         origins, aims, normals = (np.empty((count, 3)) for _ in range(3))
-        given = (_held(t).reshape(-1, 3).numpy() for t in (origins_mm, directions))
-        aim_rays(*given, origins, aims)
-        np.negative(aims, out=normals)
-        struck, t = torch.zeros(count, dtype=torch.int8), np.full(count, float(range_mm))
+        given = [_held(t).reshape(-1, 3).numpy() for t in (origins_mm, directions)]
+        struck = torch.zeros(count, dtype=torch.int8)
         body, face = torch.full((2, count), -1, dtype=torch.int32)
-        found = (struck.numpy(), body.numpy(), face.numpy(), t, normals)
-        for number, (one, surface) in enumerate(zip(self.bodies, self._surfaces, strict=True)):
-            frame = (part.numpy() for part in self._inward(one, poses))
-            tree, outward = self._trees[number], surface.normals.numpy()
-            mesh = (tree.arrays, tree.order, outward, number, int(struck_of(one)))
-            rays_to_body(origins, aims, each, *frame, *mesh, *found)
-        for name, line in arms.items():
-            radius, line = self.radius_mm(name), _held(line).numpy()
-            gap = self_contact_gap_mm(radius) if name == own else -1.0
-            kind = int(Struck.OWN_ARM if name == own else Struck.OTHER_ARM)
-            before, segment = t.copy(), np.zeros(count, np.int64)
-            rays = (part.reshape(-1, each, 3) for part in (origins, aims))
-            ends = (part.reshape(-1, each) for part in (t, segment))
-            rays_to_chains(*rays, line, radius, gap, *ends)
-            chain_hits(origins, aims, each, line, kind, before, segment, *found)
+        t, segments = np.full(count, float(range_mm)), np.zeros(count, np.int64)
         point, normal = torch.empty((2, count, 3), dtype=dtype)
         distance, incidence = torch.empty((2, count), dtype=dtype)
-        arrays = (part.numpy() for part in (point, normal, distance, incidence))
-        ray_ends(origins, aims, t, normals, *arrays)
+        found = (struck.numpy(), body.numpy(), face.numpy(), t, normals)
+        ends = [part.numpy() for part in (point, normal, distance, incidence)]
+        bodies = []
+        for number, (one, surface) in enumerate(zip(self.bodies, self._surfaces, strict=True)):
+            turn, shift = (part.numpy() for part in self._inward(one, poses))
+            tree, outward = self._trees[number], surface.normals.numpy()
+            mesh = (tree.arrays, tree.order, outward, number, int(struck_of(one)))
+            bodies.append((turn, shift, mesh))
+        chains = []
+        for name, line in arms.items():
+            radius = self.radius_mm(name)
+            gap = self_contact_gap_mm(radius) if name == own else -1.0
+            kind = int(Struck.OWN_ARM if name == own else Struck.OTHER_ARM)
+            chains.append((_held(line).numpy(), radius, gap, kind))
+
+        def follow(part: slice) -> None:
+            rays = slice(part.start * each, part.stop * each)
+            o, d, n, distances = origins[rays], aims[rays], normals[rays], t[rays]
+            aim_rays(*(array[rays] for array in given), o, d)
+            np.negative(d, out=n)
+            hits = [array[rays] for array in found]
+            for turn, shift, mesh in bodies:
+                rays_to_body(o, d, each, _of_rows(turn, part), _of_rows(shift, part), *mesh, *hits)
+            for line, radius, gap, kind in chains:
+                before, segment = distances.copy(), segments[rays]
+                aimed = (array.reshape(-1, each, 3) for array in (o, d))
+                met = (array.reshape(-1, each) for array in (distances, segment))
+                rays_to_chains(*aimed, line[part], radius, gap, *met)
+                chain_hits(o, d, each, line[part], kind, before, segment, *hits)
+            ray_ends(o, d, distances, n, *(array[rays] for array in ends))
+
+        over_rows(len(origins_mm), follow)
         return RayHit(
             struck=struck.reshape(shape),
             body=body.reshape(shape),
@@ -322,17 +337,28 @@ class BatchedScene:
         From eyes (B, 3) to ends (B, M, 3) mm, world frame, distance_mm (B, M) apart; what a line
         meets in its last short_mm does not count. Arms, own and poses are those of `cast`.
         """
-        eyes, clear = eyes_mm.contiguous().numpy(), wanted.clone()
-        ends, distance = ends_mm.numpy(), distance_mm.numpy()
-        flags = clear.numpy()
+        clear = wanted.clone()
+        lines = [t.numpy() for t in (eyes_mm.contiguous(), ends_mm, distance_mm)]
+        asked, flags = wanted.numpy(), clear.numpy()
+        chains, bodies = [], []
         for name, line in (arms or {}).items():
             radius = self.radius_mm(name)
             gap = self_contact_gap_mm(radius) if name == own else -1.0
-            chain = _held(line).numpy(), radius, gap
-            hide_behind_chain(eyes, ends, distance, short_mm, *chain, wanted.numpy(), flags)
+            chains.append((_held(line).numpy(), radius, gap))
         for body, tree in zip(self.bodies, self._trees, strict=True):
             turn, shift = (t.numpy() for t in self._inward(body, poses))
-            hide_behind_body(eyes, ends, distance, short_mm, turn, shift, tree.arrays, flags)
+            bodies.append((turn, shift, tree.arrays))
+
+        def hide(part: slice) -> None:
+            place = [array[part] for array in lines]
+            for line, radius, gap in chains:
+                chain = (line[part], radius, gap)
+                hide_behind_chain(*place, short_mm, *chain, asked[part], flags[part])
+            for turn, shift, tree in bodies:
+                frame = (_of_rows(turn, part), _of_rows(shift, part))
+                hide_behind_body(*place, short_mm, *frame, tree, flags[part])
+
+        over_rows(len(clear), hide)
         return clear
 
     def _inward(self, body: Body, poses) -> tuple[torch.Tensor, torch.Tensor]:
@@ -348,7 +374,12 @@ class BatchedScene:
         if not self.compiled:
             return chains_apart_torch(first, second, radii, self.horizon_mm)
         out = torch.empty(len(first), dtype=first.dtype)
-        chains_apart(first.numpy(), second.numpy(), radii, self.horizon_mm, out.numpy())
+        one, other, found = first.numpy(), second.numpy(), out.numpy()
+
+        def measure(part: slice) -> None:
+            chains_apart(one[part], other[part], radii, self.horizon_mm, found[part])
+
+        over_rows(len(out), measure)
         return out
 
     def _folded(self, line, radius: float) -> torch.Tensor:
@@ -356,7 +387,12 @@ class BatchedScene:
         if not self.compiled:
             return chains_folded_torch(line, radius, gap, self.horizon_mm)
         out = torch.empty(len(line), dtype=line.dtype)
-        chains_folded(line.numpy(), radius, gap, self.horizon_mm, out.numpy())
+        lines, found = line.numpy(), out.numpy()
+
+        def measure(part: slice) -> None:
+            chains_folded(lines[part], radius, gap, self.horizon_mm, found[part])
+
+        over_rows(len(out), measure)
         return out
 
 
@@ -625,9 +661,15 @@ class CompiledSurface:
         given (K,) bool: the centreline's own points, where depth inside the body counts.
         """
         out = torch.empty(len(lines), dtype=lines.dtype)
-        place = (lines.numpy(), given.numpy(), turn.numpy(), shift.numpy())
-        limits = (radius, within, horizon)
-        chains_to_surface(*place, *limits, *self.constants, self._tree.arrays, out.numpy())
+        arms, points, found = lines.numpy(), given.numpy(), out.numpy()
+        turns, shifts = turn.numpy(), shift.numpy()
+        rest = (radius, within, horizon, *self.constants, self._tree.arrays)
+
+        def measure(part: slice) -> None:
+            frame = (_of_rows(turns, part), _of_rows(shifts, part))
+            chains_to_surface(arms[part], points, *frame, *rest, found[part])
+
+        over_rows(len(out), measure)
         return out
 
 
@@ -654,13 +696,19 @@ def refined(lines: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         return lines, given
     if lines.device.type == "cpu":
         fine = torch.empty((len(lines), len(given), 3), dtype=lines.dtype)
-        divide_steps(lines.numpy(), np.array(parts), fine.numpy())
+        whole, counts, divided = lines.numpy(), np.array(parts), fine.numpy()
+        over_rows(len(lines), lambda part: divide_steps(whole[part], counts, divided[part]))
         return fine, given
     pieces = [lines[:, :1]]
     for k, count in enumerate(parts):
         share = torch.arange(1, count + 1, device=lines.device, dtype=lines.dtype) / count
         pieces.append(torch.lerp(lines[:, k, None], lines[:, k + 1, None], share[:, None]))
     return torch.cat(pieces, 1), given
+
+
+def _of_rows(poses: np.ndarray, part: slice) -> np.ndarray:
+    """A body's poses (B or 1, ...) in the environments of a slice, or the one in all of them."""
+    return poses[part] if len(poses) > 1 else poses
 
 
 def _held(tensor: torch.Tensor) -> torch.Tensor:

@@ -17,6 +17,7 @@ import torch
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
 from surgisoft.scene.sight import points_in_picture
+from surgisoft.threads import over_rows
 
 LIFT_MM = 0.05
 """Lines of sight end this far above the surface, so that it does not hide its own points (mm)."""
@@ -130,20 +131,14 @@ def _compiled_view(caster, camera, eye, axis, points, normals, arms, own, where)
     wanted = torch.empty((count, each), dtype=torch.bool)
     middle = torch.empty((count, 2), dtype=eye.dtype)
     near, far = camera.range_mm
-    points_in_picture(
-        eye.contiguous().numpy(),
-        axis.contiguous().numpy(),
-        points.contiguous().numpy(),
-        normals.contiguous().numpy(),
-        LIFT_MM,
-        0.5 * camera.fov_rad,
-        float(near),
-        float(far),
-        ends.numpy(),
-        wanted.numpy(),
-        distance.numpy(),
-        middle.numpy(),
-    )
+    given = [t.contiguous().numpy() for t in (eye, axis, points, normals)]
+    found = [t.numpy() for t in (ends, wanted, distance, middle)]
+    picture = (LIFT_MM, 0.5 * camera.fov_rad, float(near), float(far))
+
+    def look(part: slice) -> None:
+        points_in_picture(*(a[part] for a in given), *picture, *(a[part] for a in found))
+
+    over_rows(count, look)
     clear = caster.clear_lines(eye, ends, distance, SHORT_MM, wanted, arms, own, **where)
     error, reach = middle.unbind(1)
     return View(

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -43,6 +42,7 @@ from surgisoft.scene.render import (
     corner_normals,
     pixel_rays,
 )
+from surgisoft.threads import over_rows
 
 
 class Label(IntEnum):
@@ -225,7 +225,7 @@ class BatchedRenderer:
         out = (rgb.numpy(), depth.numpy(), labels.numpy())
         cameras = (inward.contiguous().numpy(), maps.contiguous().numpy(), ok.numpy())
         given = (cameras, self._lens, self._inside, self._film, self._bodies, chains, beams, tissue)
-        _over_rows(count, lambda first, last: draw_rows(first, last, *given, *out))
+        over_rows(count, lambda rows: draw_rows(rows.start, rows.stop, *given, *out), block=8)
         found = zip(KINDS, (rgb, depth, labels), strict=True)
         return Images(*(one if kind in kinds else None for kind, one in found))
 
@@ -242,17 +242,6 @@ class BatchedRenderer:
 def _finite(values: Tensor) -> Tensor:
     """(B,) bool: all values of an environment are finite."""
     return values.flatten(1).isfinite().all(1)
-
-
-def _over_rows(count: int, draw) -> None:
-    """Call draw(first, last) for stretches of the rows, in as many threads as torch uses."""
-    threads = min(torch.get_num_threads(), count)
-    if threads < 2:
-        draw(0, count)
-        return
-    bounds = np.linspace(0, count, 2 * threads + 1).astype(int).tolist()
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(draw, bounds[:-1], bounds[1:]))
 
 
 def _joined_trees(bodies: Sequence[Body]) -> tuple[np.ndarray, ...]:

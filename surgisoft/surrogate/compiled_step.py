@@ -8,6 +8,7 @@ Both agree to rounding.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from surgisoft.surrogate.arm import ArmState
 from surgisoft.surrogate.effects.hysteresis import Hysteresis
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import HawNN
+from surgisoft.threads import over_rows
 
 LANES = 16
 """Numbers of float32 in the widest vectors of x86-64 (AVX-512)."""
@@ -64,42 +66,60 @@ class CompiledStep:
     @torch.no_grad()
     def __call__(self, state: ArmState, pressure: Tensor) -> tuple[ArmState, Tensor]:
         """State and key points (B, n, 3) mm, base frame, after a step at `pressure` (B, m)."""
-        network = self._network
-        state, x = self._followed(state, pressure)
-        for layer in self._hidden:
-            if isinstance(layer, nn.Linear):
-                x = torch.addmm(layer.bias, x, layer.weight.t())
-            else:
-                x = nn.functional.silu(x, inplace=True)
-        assert self._last is not None
-        x = torch.addmm(self._last[1], x, self._last[0])[:, : len(network.mean)]
-        points = torch.addcmul(network.mean, x, network.scale)
-        return state, points.view(len(pressure), network.key_points, 3)
+        points = pressure.new_empty(len(pressure), self._network.key_points, 3)
+        state, work = self.prepared(state, pressure, points)
+        over_rows(len(pressure), work)
+        return state, points
 
     @torch.no_grad()
     def follow(self, state: ArmState, pressure: Tensor) -> ArmState:
         """State after a step at `pressure` (B, m), where nobody asks for its key points."""
-        return self._followed(state, pressure)[0]
+        state, work = self.prepared(state, pressure)
+        over_rows(len(pressure), work)
+        return state
 
-    def _followed(self, state: ArmState, pressure: Tensor) -> tuple[ArmState, Tensor]:
-        """State after a step at `pressure` (B, m), and the network's inputs (B, m or 2 m) there."""
+    def prepared(
+        self, state: ArmState, pressure: Tensor, points_mm: Tensor | None = None
+    ) -> tuple[ArmState, Callable[[slice], None]]:
+        """The state after a step, and the work that fills the rows (a slice) of its tensors.
+
+        pressure: (B, m), contiguous; what stands in the rows is read when they are worked on.
+        points_mm: (B, n, 3), contiguous, which is filled with key points in the base frame. The
+        work is done without gradients.
+        """
         count, chambers = pressure.shape
+        network = self._network
         memory = pressure.new_empty(count, 0) if self.name is None else state.memory[self.name]
-        after, anchor = torch.empty_like(memory), torch.empty_like(pressure)
-        direction = torch.empty_like(pressure)
-        x = pressure.new_empty(count, chambers * (2 if self._network.directions else 1))
+        after = memory.new_empty(memory.shape)
+        anchor, direction = (pressure.new_empty(count, chambers) for _ in range(2))
+        x = pressure.new_empty(count, chambers * (2 if network.directions else 1))
         arrays = [
             _array(t) for t in (pressure, state.anchor, state.direction, anchor, direction, x)
         ]
         seen = [(t.data_ptr(), 0 if t.is_inference() else t._version) for t in self._tensors]
         if seen != self._seen:
             self._seen, self._constants, self._last = seen, self._read(), self._wide_last_layer()
-        if self.name is None:
-            _advance(*arrays, *self._constants)
-        else:
-            _advance_with_plays(*arrays, *self._constants, _array(memory), _array(after))
+        constants, last = self._constants, self._last
+        memories = [] if self.name is None else [_array(memory), _array(after)]
+        loop = _advance if self.name is None else _advance_with_plays
+        flat = None if points_mm is None else points_mm.view(count, -1)
+        assert last is not None
+
+        def work(rows: slice) -> None:
+            loop(*(a[rows] for a in arrays), *constants, *(a[rows] for a in memories))
+            if flat is None:
+                return
+            y = x[rows]
+            for layer in self._hidden:
+                if isinstance(layer, nn.Linear):
+                    y = torch.addmm(layer.bias, y, layer.weight.t())
+                else:
+                    y = nn.functional.silu(y, inplace=True)
+            y = torch.addmm(last[1], y, last[0])[:, : len(network.mean)]
+            torch.addcmul(network.mean, y, network.scale, out=flat[rows])
+
         held = {} if self.name is None else {self.name: after}
-        return ArmState(pressure, anchor, direction, held), x
+        return ArmState(pressure, anchor, direction, held), work
 
     def alone(self, state: ArmState, pressure: np.ndarray) -> LoneArmModel:
         """Steps of the one arm (B = 1) of a state; see `LoneArmModel`."""

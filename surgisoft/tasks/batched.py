@@ -23,6 +23,7 @@ from surgisoft.tasks.registry import make_with
 from surgisoft.tasks.world.images import VECTOR, images_of
 from surgisoft.tasks.world.pytree import tree_map
 from surgisoft.tasks.world.random_streams import joined, streams
+from surgisoft.threads import rows_on_threads
 
 SPREAD = 7919
 """A prime: spread starts are this many steps apart, modulo the length of an episode."""
@@ -91,6 +92,7 @@ class BatchedEnv:
         """(B,) int64: steps since each episode began."""
         return self._now.world.steps
 
+    @rows_on_threads
     @torch.inference_mode()
     def reset(self, seed: int = 0) -> dict[str, Tensor]:
         """Begin all episodes; environment i has seed + i. Returns the observations, which
@@ -104,6 +106,7 @@ class BatchedEnv:
         self._state = state
         return self._with_images(self._episodes.observe(state), self._drawn(state))
 
+    @rows_on_threads
     @torch.inference_mode()
     def step(self, actions: Mapping[str, Tensor | np.ndarray]) -> BatchedStep:
         """Advance all environments; actions: agent -> (B, m) kPa, tensors or arrays."""

@@ -14,6 +14,7 @@ from surgisoft.scene import frames
 from surgisoft.scene.ablation import (
     AblationMap,
     Tissue,
+    cut_compiled,
     longest_run,
     sweep_fluence,
     vaporisation_j_per_mm3,
@@ -304,6 +305,11 @@ def test_longest_run_goes_round_the_ring(flags):
             run += 1
         best = max(best, run)
     assert longest_run(torch.tensor([flags])).item() == best
+    peak, band = (~torch.tensor([flags])).float(), torch.rand(1, len(flags))
+    cut, gap, burnt = cut_compiled(peak, band, 1.0)
+    assert gap.item() == best
+    assert cut.item() == len(flags) - sum(flags)
+    assert burnt.item() == pytest.approx((band * peak).sum().item(), rel=1e-6)
 
 
 def test_tissue_numbers_are_the_sources():

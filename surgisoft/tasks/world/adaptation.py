@@ -43,6 +43,7 @@ from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.reach import steady_key_points
 from surgisoft.tasks.world.arm_errors import ArmErrors, ErrorPrior, jacobians
 from surgisoft.tasks.world.compiled_adaptation import learn
+from surgisoft.threads import over_rows
 
 USUAL = 0.1
 """Distance of the body, as a share of its range, at which the time constant of a lag is stated."""
@@ -301,14 +302,19 @@ class DisturbanceEstimator:
         rate = self.dt_s / prior.unrest_s
         rules = (rate, prior.innovation, prior.startling, prior.quietest, prior.liveliest)
         given = (inputs, memory.covariance, surprise, memory.unrest)
-        learn(
-            *(each.contiguous().numpy() for each in given),
+        before = [each.contiguous().numpy() for each in given]
+        constants = (
             np.float32(prior.noise_mm**2 / samples),
             self.moving.mT.contiguous().numpy(),
             np.array(rules, np.float32),
             *(each.numpy() for each in (self.keep, self.growth, self.stirs)),
-            *(each.numpy() for each in (change, after, unrest)),
         )
+        found = [each.numpy() for each in (change, after, unrest)]
+
+        def learn_rows(rows: slice) -> None:
+            learn(*(a[rows] for a in before), *constants, *(a[rows] for a in found))
+
+        over_rows(len(change), learn_rows)
         return change, after, unrest
 
     def _unrest(self, unrest: Tensor, surprise: Tensor, power: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -28,6 +29,7 @@ from surgisoft.tasks.world.compiled_arm import draw_body, drive, place
 from surgisoft.tasks.world.observer import AlphaBetaFilter, Belief
 from surgisoft.tasks.world.random_effects import RandomEffects
 from surgisoft.tasks.world.random_streams import Stream
+from surgisoft.threads import over_rows
 
 STOOD = 40
 """Measurements at each pressure before an episode from which the observer learns, where it adapts:
@@ -500,23 +502,30 @@ class ModelArm:
 
     def _stepped(self, step: CompiledStep, part: ArmPart, action: Tensor, dt_s: float) -> ArmPart:
         """The part after a step with the action (B, m) kPa, all but what is measured."""
-        command, pressure = torch.empty_like(part.command), torch.empty_like(part.pressure)
-        queue, target = torch.empty_like(part.queue), torch.empty_like(part.command)
-        drive(
-            *(
-                t.contiguous().numpy()
-                for t in (part.command, part.pressure, part.queue, part.delay, part.gain, action)
-            ),
-            self.low.numpy(),
-            self.high.numpy(),
-            np.float32(self.pneumatics.step_kPa),
-            np.float32(self.pneumatics.share(dt_s)),
-            part.arm.pressure.contiguous().numpy(),
-            *(t.numpy() for t in (command, pressure, queue, target)),
-        )
-        state, points = step(part.arm, target)
-        points = _placed(points, part.mount)
-        line, direction = self._body(points, part.mount)
+        kPa = part.command.shape
+        command, pressure, target = (part.command.new_empty(kPa) for _ in range(3))
+        queue = part.queue.new_empty(part.queue.shape)
+        given = (part.command, part.pressure, part.queue, part.delay, part.gain, action)
+        before = [t.contiguous().numpy() for t in given]
+        beside = part.arm.pressure.contiguous().numpy()
+        limits = (self.low.numpy(), self.high.numpy())
+        step_kPa, share = self.pneumatics.step_kPa, self.pneumatics.share(dt_s)
+        pumps = (*limits, np.float32(step_kPa), np.float32(share))
+        after = [t.numpy() for t in (command, pressure, queue, target)]
+
+        shape, points = (part.points_mm.new_empty(part.points_mm.shape) for _ in range(2))
+        state, bend = step.prepared(part.arm, target, shape)
+        move = _placing(shape, part.mount, points)
+        line, direction, draw = self._drawing(points, part.mount)
+
+        def advance(rows: slice) -> None:
+            drive(*(a[rows] for a in before), *pumps, beside[rows], *(a[rows] for a in after))
+            bend(rows)
+            move(rows)
+            draw(rows)
+
+        with torch.no_grad():
+            over_rows(len(command), advance)
         return replace(
             part,
             command=command,
@@ -530,19 +539,28 @@ class ModelArm:
 
     def _body(self, points_mm: Tensor, mount: Tensor) -> tuple[Tensor, Tensor]:
         """Centreline (B, K, 3) mm and tip direction (B, 3), compiled."""
+        line, direction, draw = self._drawing(points_mm.contiguous(), mount)
+        over_rows(len(line), draw)
+        return line, direction
+
+    def _drawing(
+        self, points_mm: Tensor, mount: Tensor
+    ) -> tuple[Tensor, Tensor, Callable[[slice], None]]:
+        """Centreline and tip direction as `_body`, and the work that fills their rows (a slice).
+
+        points_mm: contiguous; read when the rows are worked on.
+        """
         count, position = len(points_mm), self.backbone.position
         line = points_mm.new_empty(count, len(self.shaft) + len(position), 3)
         direction = points_mm.new_empty(count, 3)
-        draw_body(
-            points_mm.contiguous().numpy(),
-            mount.contiguous().numpy(),
-            self.shaft.numpy(),
-            position.numpy(),
-            self.backbone.derivative[-1].numpy(),
-            line.numpy(),
-            direction.numpy(),
-        )
-        return line, direction
+        given = [t.contiguous().numpy() for t in (points_mm, mount)]
+        backbone = (position.numpy(), self.backbone.derivative[-1].numpy())
+        shaft, found = self.shaft.numpy(), [t.numpy() for t in (line, direction)]
+
+        def draw(rows: slice) -> None:
+            draw_body(*(a[rows] for a in given), shaft, *backbone, *(a[rows] for a in found))
+
+        return line, direction, draw
 
     def alone(self, part: ArmPart, dt_s: float) -> LoneArm | None:
         """Steps of one environment's arm in kept arrays; None where the reference has to step it.
@@ -704,6 +722,12 @@ def _copied(tensor: Tensor) -> np.ndarray:
 
 def _placed(points: Tensor, mount: Tensor) -> Tensor:
     """Key points (B, n, 3) mm, world frame, of those in the base frames (B, 4, 4), compiled."""
-    out = torch.empty_like(points)
-    place(points.contiguous().numpy(), mount.contiguous().numpy(), out.numpy())
+    out = points.new_empty(points.shape)
+    over_rows(len(out), _placing(points.contiguous(), mount, out))
     return out
+
+
+def _placing(points: Tensor, mount: Tensor, out: Tensor) -> Callable[[slice], None]:
+    """The work that fills rows (a slice) of `out` as `_placed`; points: contiguous, read then."""
+    before, mounts, after = points.numpy(), mount.contiguous().numpy(), out.numpy()
+    return lambda rows: place(before[rows], mounts[rows], after[rows])

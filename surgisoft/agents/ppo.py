@@ -27,6 +27,7 @@ from surgisoft.agents.distributed import Processes
 from surgisoft.agents.policy_network import compile_activations, network_config, noise_config
 from surgisoft.agents.presets import Preset
 from surgisoft.agents.vec_env import STATE, JointEnv
+from surgisoft.threads import rows_on_threads
 
 
 def algorithm_config(agent: str, preset: Preset, processes: Processes, critic: str = STATE) -> dict:
@@ -131,6 +132,7 @@ class RolloutMeans:
 
 
 @torch.inference_mode()
+@rows_on_threads
 def collect_rollout(env: JointEnv, agents: dict[str, PPO], seen: TensorDict, steps: int):
     """Roll out `steps` steps into the agents' storages; last observations and `RolloutMeans`."""
     notes: dict[str, list[Tensor]] = {}

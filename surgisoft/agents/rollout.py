@@ -15,6 +15,7 @@ from surgisoft.progress import Progress, silent
 from surgisoft.tasks.base import Episodes, Outcome, Task, TaskState
 from surgisoft.tasks.episodes.log import EpisodeLog, EpisodeRecorder
 from surgisoft.tasks.world.pytree import rows
+from surgisoft.threads import rows_on_threads
 
 BATCH = 256
 """Default number of episodes that run side by side."""
@@ -135,6 +136,7 @@ def rollout(
     return joined(parts)
 
 
+@rows_on_threads
 @torch.inference_mode()
 def _rolled_out(
     task: Task,

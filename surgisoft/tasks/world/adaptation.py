@@ -47,6 +47,8 @@ from surgisoft.threads import over_rows
 
 USUAL = 0.1
 """Distance of the body, as a share of its range, at which the time constant of a lag is stated."""
+LEARN_BLOCK = 32
+"""Rows of a block of the filter's update, which takes 25 µs a row (a count)."""
 
 
 @dataclass(frozen=True)
@@ -314,7 +316,7 @@ class DisturbanceEstimator:
         def learn_rows(rows: slice) -> None:
             learn(*(a[rows] for a in before), *constants, *(a[rows] for a in found))
 
-        over_rows(len(change), learn_rows)
+        over_rows(len(change), learn_rows, block=LEARN_BLOCK)
         return change, after, unrest
 
     def _unrest(self, unrest: Tensor, surprise: Tensor, power: Tensor) -> Tensor:

@@ -33,6 +33,7 @@ EXTRA_OF = {
     "nibabel": "segmentation",
     "nrrd": "segmentation",
     "skimage": "segmentation",
+    "warp": "gpu",
 }
 """The extra that installs a module, by the module's name."""
 

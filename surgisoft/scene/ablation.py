@@ -11,12 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
 
 from surgisoft.compiled import compiled
 from surgisoft.errors import InputError
+from surgisoft.scene.batched import default_engine
 from surgisoft.scene.dose_patch import HEALTHY, LESION, RING, SPACING_WAISTS, DosePatch, samples_at
 from surgisoft.threads import over_rows
 
@@ -284,7 +286,7 @@ class AblationMap:
         sums = [state.dose, state.peak, state.band_mm2, state.zone_mm2, state.zone_j]
         if not in_place:
             sums = [t.clone() for t in sums]
-        deposit = self.deposit_compiled if self.device.type == "cpu" else self.deposit_torch
+        deposit = getattr(self, f"deposit_{default_engine(self.device)}")
         for began_of, ended_of, along, joule in _each_beam(began, ended, middle, energy):
             sums = [*deposit(began_of, ended_of, along, joule, state.ring, *sums)]
         dose, peak, band, area, zone_j = sums
@@ -326,6 +328,19 @@ class AblationMap:
 
         over_rows(len(energy), deposit)
         return dose, peak, band, area, joule
+
+    def deposit_warp(self, began, ended, direction, energy, ring, dose, peak, band, area, joule):
+        """`deposit_compiled` as a Warp kernel, for accelerators; changes the arrays in place."""
+        self._dose_kernel(began, ended, direction, energy, ring, (dose, peak, band, area, joule))
+        return dose, peak, band, area, joule
+
+    @cached_property
+    def _dose_kernel(self):
+        from surgisoft.scene.warp_dose import DoseKernel
+
+        reach_mm = REACH_WAISTS * self.waist_mm
+        limits = (self.waist_mm, reach_mm, STEEPEST_COSINE)
+        return DoseKernel(self.patches, self._counted, *limits, self.device)
 
     def deposit_torch(self, began, ended, direction, energy, ring, dose, peak, band, area, joule):
         """`deposit_compiled` in torch, for accelerators, with all samples and nothing in place."""

@@ -11,8 +11,10 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from itertools import combinations
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -54,8 +56,8 @@ from surgisoft.scene.torch_queries import (
 )
 from surgisoft.threads import over_rows
 
-ENGINES = ("compiled", "torch")
-"""The batched engines: compiled queries, or torch alone."""
+ENGINES = ("compiled", "torch", "warp")
+"""The batched engines: compiled queries, torch alone, or NVIDIA Warp kernels (extra `gpu`)."""
 LONGEST_SEGMENT_MM = 6.0
 """Longer segments of a centreline are divided before the distance to the bodies is taken (mm)."""
 MOST_PARTS = 256
@@ -93,7 +95,10 @@ class BatchedScene:
         cache: Path | None = None,
         engine: str | None = None,
     ):
-        """`engine` is `compiled` (CPU only, its default) or `torch` (any device)."""
+        """`engine` is `compiled` (CPU only, its default), `torch` or `warp` (any device).
+
+        The default on an accelerator is `warp` where it is installed, else `torch`.
+        """
         for name, radius in radii_mm.items():
             if not (math.isfinite(radius) and radius > 0.0):
                 raise InputError(f"radius of arm '{name}' is {radius} mm: expected more than 0")
@@ -101,14 +106,15 @@ class BatchedScene:
         self.device = torch.device(device)
         self.horizon_mm, self.exact_within_mm = float(horizon_mm), float(exact_within_mm)
         thickest = max(self.radii_mm.values(), default=1.0)
-        engine = engine or ("compiled" if self.device.type == "cpu" else "torch")
+        engine = engine or default_engine(self.device)
         if engine not in ENGINES:
             raise unknown_name("geometry engine", engine, ENGINES)
         if engine == "compiled" and self.device.type != "cpu":
             raise InputError(f"the compiled engine runs on the CPU, not on '{self.device}'")
         self.compiled = engine == "compiled"
-        kind = CompiledSurface if self.compiled else TorchSurface
-        self._surfaces, self._trees = [], []
+        kind, *self._of_chains = _queries(engine)
+        self._surfaces: list[Any] = []
+        self._trees: list[TriangleTree] = []
         self._at_home = {body.name: self._inverse(_pose_of(body)) for body in self.bodies}
         for body in self.bodies:
             tree = build_tree(body.mesh)
@@ -184,7 +190,7 @@ class BatchedScene:
             turn, shift = self._inward(body, poses)
             o = origins @ turn.mT + shift[:, None]
             d = aims @ turn.mT
-            assert isinstance(surface, TorchSurface), "the compiled engine has its own loops"
+            assert not isinstance(surface, CompiledSurface), "the compiled engine has its own loops"
             t, f = surface.first_hit(o.reshape(-1, 3), d.reshape(-1, 3), float(range_mm))
             t, f = t.view_as(best), f.view_as(best)
             nearer = (f >= 0) & (t < best)
@@ -197,7 +203,8 @@ class BatchedScene:
         for name, line in (arms or {}).items():
             radius, line = self.radius_mm(name), _held(line)
             gap = self_contact_gap_mm(radius) if name == own else -1.0
-            t, segment = rays_to_chains_torch(origins, aims, line, radius, gap, best)
+            to_chains = self._of_chains[2]
+            t, segment = to_chains(origins, aims, line, radius, gap, best)
             nearer = t < best
             point = origins + t[..., None] * aims
             outward = chain_normal(point, line.double()[:, None], segment)
@@ -372,7 +379,7 @@ class BatchedScene:
 
     def _apart(self, first, second, radii: float) -> torch.Tensor:
         if not self.compiled:
-            return chains_apart_torch(first, second, radii, self.horizon_mm)
+            return self._of_chains[0](first, second, radii, self.horizon_mm)
         out = torch.empty(len(first), dtype=first.dtype)
         one, other, found = first.numpy(), second.numpy(), out.numpy()
 
@@ -385,7 +392,7 @@ class BatchedScene:
     def _folded(self, line, radius: float) -> torch.Tensor:
         gap = self_contact_gap_mm(radius)
         if not self.compiled:
-            return chains_folded_torch(line, radius, gap, self.horizon_mm)
+            return self._of_chains[1](line, radius, gap, self.horizon_mm)
         out = torch.empty(len(line), dtype=line.dtype)
         lines, found = line.numpy(), out.numpy()
 
@@ -394,6 +401,24 @@ class BatchedScene:
 
         over_rows(len(out), measure)
         return out
+
+
+def default_engine(device: str | torch.device) -> str:
+    """The fastest engine that is installed for a device."""
+    if torch.device(device).type == "cpu":
+        return "compiled"
+    return "warp" if find_spec("warp") else "torch"
+
+
+def _queries(engine: str) -> tuple:
+    """An engine's surface, and its functions: arms apart, an arm folded, rays to arms."""
+    if engine == "warp":
+        from surgisoft.scene import warp_queries as warp
+
+        chains = (warp.chains_apart_warp, warp.chains_folded_warp, warp.rays_to_chains_warp)
+        return warp.WarpSurface, *chains
+    kind = CompiledSurface if engine == "compiled" else TorchSurface
+    return kind, chains_apart_torch, chains_folded_torch, rays_to_chains_torch
 
 
 @dataclass(frozen=True, eq=False)
@@ -604,7 +629,7 @@ class LoneBeam:
 
 
 def strained_clearance(
-    surface: CompiledSurface | TorchSurface,
+    surface: Surface,
     lines: torch.Tensor,
     given: torch.Tensor,
     turn: torch.Tensor,
@@ -634,6 +659,25 @@ def strained_clearance(
     found = (least + radius) / scale.to(least.dtype) - radius
     known = (size[:, 0] > 0.5 * SLOPE_MM) & (least < horizon - SLOPE_MM)
     return torch.where(known, found, least).clamp(max=horizon)
+
+
+class Surface(Protocol):
+    """One body's surface on a device, for clearance queries."""
+
+    normals: torch.Tensor
+    """(F, 3) outward unit normals of the faces, in the body's frame."""
+
+    def clearance(
+        self,
+        lines: torch.Tensor,
+        given: torch.Tensor,
+        turn: torch.Tensor,
+        shift: torch.Tensor,
+        radius: float,
+        within: float,
+        horizon: float,
+    ) -> torch.Tensor:
+        """(B,) mm: signed clearance of arms (B, K, 3), world frame; see `CompiledSurface`."""
 
 
 class CompiledSurface:

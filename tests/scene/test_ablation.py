@@ -24,6 +24,7 @@ from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.dose_patch import HEALTHY, LESION, RING, cut_patch, samples_at
 from surgisoft.scene.mesh import Body
 from surgisoft.scene.render import Renderer
+from tests.scene.engines import ON_ACCELERATORS
 from tests.scene.shapes import ball, box
 
 WAIST = 0.4
@@ -206,7 +207,8 @@ def test_depth_asks_for_more_than_the_surface(slab):
     assert deep.report(swept(deep, points, 0.05, 2 * power)).completion.item() == 1.0
 
 
-def test_compiled_and_torch_deposits_agree(slab):
+@pytest.mark.parametrize("engine", ON_ACCELERATORS)
+def test_deposits_of_the_engines_agree(slab, engine):
     ablation = AblationMap(slab, WAIST)
     rng = np.random.default_rng(0)
     count = 12
@@ -218,7 +220,8 @@ def test_compiled_and_torch_deposits_agree(slab):
     names = ("dose", "peak", "band_mm2", "zone_mm2", "zone_j")
     beam = (began, ended, aim, energy, state.ring)
     one = ablation.deposit_compiled(*beam, *(getattr(state, n).clone() for n in names))
-    two = ablation.deposit_torch(*beam, *(getattr(state, n).clone() for n in names))
+    deposit = getattr(ablation, f"deposit_{engine}")
+    two = deposit(*beam, *(getattr(state, n).clone() for n in names))
     peak = one[0].max().item()
     torch.testing.assert_close(one[0], two[0], atol=1e-4 * peak, rtol=1e-3)
     torch.testing.assert_close(one[1], two[1], atol=1e-4 * peak, rtol=1e-3)

@@ -24,6 +24,7 @@ from surgisoft.scene.torch_queries import (
     chains_folded_torch,
 )
 from surgisoft.scene.torch_queries import segment_triangle_d2 as segment_triangle_d2_torch
+from tests.scene.engines import ON_ACCELERATORS
 from tests.scene.shapes import ball, box, lumpy
 
 RADIUS = 5.0
@@ -61,9 +62,14 @@ def organ_scene():
     return bodies, BatchedScene(bodies, {"a": RADIUS}, most_nodes=300_000)
 
 
-def on_torch(bodies):
-    """The same scene on the torch engine, which otherwise serves accelerators."""
-    return BatchedScene(bodies, {"a": RADIUS}, most_nodes=300_000, engine="torch")
+@pytest.fixture(scope="module", params=ON_ACCELERATORS)
+def on_accelerator(request):
+    """Makes the same scene on an engine that otherwise serves accelerators."""
+
+    def made(bodies):
+        return BatchedScene(bodies, {"a": RADIUS}, most_nodes=300_000, engine=request.param)
+
+    return made
 
 
 def test_ten_thousand_poses_agree_with_fcl(organ_scene):
@@ -88,13 +94,13 @@ def test_ten_thousand_poses_agree_with_fcl(organ_scene):
     assert 0.2 < hits.mean() < 0.9
 
 
-def test_torch_and_compiled_engines_agree(organ_scene):
+def test_the_engines_agree(organ_scene, on_accelerator):
     bodies, scene = organ_scene
     arms = {"a": random_arms(400, seed=2)}
-    compiled, in_torch = scene.clearance(arms), on_torch(bodies).clearance(arms)
+    compiled, other = scene.clearance(arms), on_accelerator(bodies).clearance(arms)
     assert (compiled.bodies_mm < 0).float().mean() > 0.2
-    torch.testing.assert_close(in_torch.bodies_mm, compiled.bodies_mm, atol=1e-5, rtol=0)
-    torch.testing.assert_close(in_torch.self_mm, compiled.self_mm, atol=1e-3, rtol=0)
+    torch.testing.assert_close(other.bodies_mm, compiled.bodies_mm, atol=1e-5, rtol=0)
+    torch.testing.assert_close(other.self_mm, compiled.self_mm, atol=1e-3, rtol=0)
 
 
 coordinate = st.floats(-60, 60)
@@ -152,14 +158,14 @@ def test_moving_a_body_is_moving_the_arm_back(organ_scene):
     )
 
 
-def test_a_diverged_environment_stays_alone(organ_scene):
+def test_a_diverged_environment_stays_alone(organ_scene, on_accelerator):
     bodies, scene = organ_scene
     arms = random_arms(8, seed=5)
     clean = scene.clearance({"a": arms})
     for bad in (float("nan"), float("inf")):
         broken = arms.clone()
         broken[3, 5, 1] = bad
-        for engine in (scene, on_torch(bodies)):
+        for engine in (scene, on_accelerator(bodies)):
             found = engine.clearance({"a": broken})
             assert found.bodies_mm[3].isnan().all()
             assert found.self_mm[3].isnan().all()
@@ -167,8 +173,9 @@ def test_a_diverged_environment_stays_alone(organ_scene):
             assert torch.equal(found.bodies_mm[kept], clean.bodies_mm[kept])
 
 
-def test_arms_against_each_other_and_themselves():
-    scene = BatchedScene([], {"a": 3.0, "b": 4.0})
+@pytest.mark.parametrize("engine", ["compiled", *ON_ACCELERATORS])
+def test_arms_against_each_other_and_themselves(engine):
+    scene = BatchedScene([], {"a": 3.0, "b": 4.0}, engine=engine)
     a, b = random_arms(300, seed=6, near=20, far=60), random_arms(300, seed=7, near=20, far=60)
     found = scene.clearance({"a": a, "b": b})
     ends = (a[:, :-1, None], a[:, 1:, None], b[:, None, :-1], b[:, None, 1:])
@@ -300,15 +307,15 @@ def test_bad_requests_are_named():
         BatchedScene([], {"a": 0.0})
     with pytest.raises(InputError, match="known are a"):
         BatchedScene([], {"a": 1.0}).clearance({"b": torch.zeros(1, 2, 3)})
-    with pytest.raises(InputError, match="known are compiled, torch"):
-        BatchedScene([], {"a": 1.0}, engine="warp")
+    with pytest.raises(InputError, match="known are compiled, torch, warp"):
+        BatchedScene([], {"a": 1.0}, engine="embree")
     with pytest.raises(InputError, match="runs on the CPU"):
         BatchedScene([], {"a": 1.0}, device="cuda", engine="compiled")
     with pytest.raises(InputError, match="margin"):
         field.load_field(ball(), 0.0, 1.0)
 
 
-def test_a_rigid_shaft_is_as_exact_as_short_segments(organ_scene):
+def test_a_rigid_shaft_is_as_exact_as_short_segments(organ_scene, on_accelerator):
     """A first segment of 100 mm behind the arm; sideways passes of long segments too."""
     bodies, scene = organ_scene
     checker = CollisionChecker(bodies)
@@ -316,7 +323,7 @@ def test_a_rigid_shaft_is_as_exact_as_short_segments(organ_scene):
     back = frames.normalise(arms[:, 0] - arms[:, 1])
     arms = torch.cat((arms[:, :1] + 100.0 * back[:, None], arms), 1)
     arms[::2] = arms[::2].flip(0) - 60.0 * back[::2, None]
-    for engine in (scene, on_torch(bodies)):
+    for engine in (scene, on_accelerator(bodies)):
         found = engine.clearance({"a": arms}).bodies_mm[:, 0, 0]
         for i, line in enumerate(arms.double().numpy()):
             shapes = {"a": ArmShape(line, RADIUS)}

@@ -16,6 +16,7 @@ from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.mesh import Body
 from surgisoft.scene.rays import EmbreeSurface, Struck, rays_to_chains
 from surgisoft.scene.torch_queries import TorchTree, rays_to_chains_torch
+from tests.scene.engines import ON_ACCELERATORS
 from tests.scene.shapes import arc_points, ball, box, lumpy
 
 RANGE = 250.0
@@ -88,7 +89,7 @@ def lasers(count, rng):
     return frames.pose_from_z(away * 150, -away + 0.4 * rng.normal(size=(count, 3)))
 
 
-@pytest.mark.parametrize("name", ["compiled", "torch"])
+@pytest.mark.parametrize("name", ["compiled", *ON_ACCELERATORS])
 def test_arms_in_the_way_agree_with_fcl(scene, name, tmp_path):
     bodies, _ = scene
     radii = {"laser": 4.0, "scope": 5.0}

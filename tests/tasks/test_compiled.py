@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from importlib.util import find_spec
 
 import pytest
 import torch
@@ -24,10 +25,11 @@ LOOK_EVERY = 150
 def test_compiled_arms_agree_with_the_reference_over_whole_episodes(name):
     task, random = make_task(name), torch.Generator().manual_seed(1)
     plain = {arm: body.reference() for arm, body in task.world.arms.items()}
-    around, other, dt_s = task.world.scene, None, task.world.config.dt_s
+    around, others, dt_s = task.world.scene, [], task.world.config.dt_s
     if around is not None:
-        radii = around.geometry.radii_mm
-        other = BatchedScene(around.geometry.bodies, radii, engine="torch")
+        engines = ["torch"] + ["warp"] * (find_spec("warp") is not None)
+        given = (around.geometry.bodies, around.geometry.radii_mm)
+        others = [BatchedScene(*given, engine=engine) for engine in engines]
     with torch.inference_mode():
         world = Episodes(task).seeded(4, EPISODES).world
         stream, found, expected = world.stream, dict(world.arms), dict(world.arms)
@@ -40,9 +42,10 @@ def test_compiled_arms_agree_with_the_reference_over_whole_episodes(name):
                     off = (getattr(found[arm], field) - getattr(expected[arm], field)).abs().max()
                     assert off < AGREE_MM, (arm, field, step)
                 assert torch.equal(found[arm].arm.direction, expected[arm].arm.direction)
-            if other is not None and step % LOOK_EVERY == 0:
+            if others and step % LOOK_EVERY == 0:
                 stream, scene = around.start(stream, found)
-                assert_scenes_agree(around, other, replace(world, arms=found, scene=scene))
+                for other in others:
+                    assert_scenes_agree(around, other, replace(world, arms=found, scene=scene))
 
 
 def assert_scenes_agree(around, other, world):

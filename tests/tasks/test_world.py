@@ -30,6 +30,7 @@ from surgisoft.tasks.world.observer import AlphaBetaFilter
 from surgisoft.tasks.world.pytree import rows, tree_map
 from surgisoft.tasks.world.random_streams import streams
 from surgisoft.tasks.world.world import Mounted, World, WorldConfig, scene_world, single_arm_world
+from tests.scene.engines import ON_ACCELERATORS
 
 STILL = Randomisation(history=0, start_kPa=0.0)
 LIVELY = Randomisation(
@@ -175,9 +176,10 @@ def test_geometry_is_the_referees(theatre, phantom):
         np.testing.assert_allclose(hit.point_mm, scene.hit.point_mm[i].numpy(), atol=1e-3)
 
 
-def test_the_accelerators_engine_gives_the_same_world(theatre, phantom):
-    """The torch engine, here on the CPU, beside the compiled one."""
-    other = scene_world(phantom, theatre.config, engine="torch")
+@pytest.mark.parametrize("engine", ON_ACCELERATORS)
+def test_the_accelerators_engine_gives_the_same_world(theatre, phantom, engine):
+    """Engines for accelerators, here on the CPU, beside the compiled one."""
+    other = scene_world(phantom, theatre.config, engine=engine)
     one, two = theatre.start(streams(7, 3)), other.start(streams(7, 3))
     for action in actions_of(theatre, 3, 4, seed=2):
         one, two = theatre.step(one, action, 20.0), other.step(two, action, 20.0)

@@ -1,0 +1,75 @@
+"""The laser's dose on an accelerator, by a kernel of `warp_kernels`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from surgisoft.scene import warp_kernels as kernels
+from surgisoft.scene.dose_patch import RING, DosePatch
+from surgisoft.scene.warp_kernels import wp
+from surgisoft.scene.warp_queries import held, launch, vectors
+
+
+class DoseKernel:
+    """Deposits sweeps of beams on the samples of rings that share them, on a device."""
+
+    def __init__(
+        self,
+        patches: Sequence[DosePatch],
+        counted: np.ndarray,
+        waist_mm: float,
+        reach_mm: float,
+        steepest: float,
+        device: str | torch.device,
+    ):
+        """counted (3,) J/mm^2: dose from which each zone's area counts; waist_mm: the beam's 1/e^2
+        radius; reach_mm: distance from its axis beyond which there is no dose; steepest: cosine of
+        the steepest faces that it lights."""
+
+        def there(array, dtype=torch.float64) -> torch.Tensor:
+            return torch.tensor(np.ascontiguousarray(array), dtype=dtype, device=device)
+
+        patch, grid = patches[0], patches[0].buckets
+        zones, stations = (
+            there(np.stack([getattr(one, name) for one in patches]), torch.int32)
+            for name in ("zone", "station")
+        )
+        samples = (there(patch.points_mm), there(patch.normals), there(patch.areas_mm2))
+        least, starts = there(counted), there(grid.starts, torch.int64)
+        # Warp's arrays do not own their memory.
+        self._kept = (*samples, zones, stations, least, starts)
+        points, normals, areas = samples
+        self._constants = [
+            *(float(waist_mm), float(reach_mm), float(steepest)),
+            wp.from_torch(least),
+            *(vectors(points), vectors(normals), wp.from_torch(areas)),
+            *(wp.from_torch(zones), wp.from_torch(stations)),
+            wp.vec3d(*map(float, grid.origin_mm)),
+            float(grid.cell_mm),
+            wp.vec3i(*map(int, grid.shape)),
+            wp.from_torch(starts),
+        ]
+
+    def __call__(
+        self,
+        began: torch.Tensor,
+        ended: torch.Tensor,
+        direction: torch.Tensor,
+        energy: torch.Tensor,
+        ring: torch.Tensor,
+        sums: Sequence[torch.Tensor],
+    ) -> None:
+        """Add one sweep of each environment to `sums`, which it changes in place.
+
+        began, ended (B, 3) mm, the organ's frame; direction (B, 3) unit vectors; energy (B,) J;
+        ring (B,); sums: dose, peak, band, area and energy of an `AblationState`, float32.
+        """
+        beams, power = [held(t) for t in (began, ended, direction)], energy.float().contiguous()
+        rings = ring.contiguous()
+        given = [*map(vectors, beams), wp.from_torch(power), wp.from_torch(rings)]
+        changed = [wp.from_torch(one) for one in sums]
+        arguments = [*given, *self._constants, *changed, RING]
+        launch(kernels.deposit, len(rings), arguments, beams[0])

@@ -1,0 +1,624 @@
+"""Kernels of NVIDIA Warp: clearance, rays and dose, one thread for each query.
+
+They walk the same tree and field as the compiled queries of `bvh`, `distance`, `rays` and
+`ablation`, in float64, so that results agree to rounding; the formulas and their sources stand
+there. Warp translates these functions to C++ and CUDA: `int(0)` declares a variable, `0` a
+constant, and float64 constants have names.
+"""
+
+import math
+
+from surgisoft.extras import with_advice
+from surgisoft.scene.bvh import PARALLEL as PARALLEL_SHARE
+from surgisoft.scene.bvh import STACK as STACK_SIZE
+
+with with_advice():
+    import warp as wp
+
+wp.config.log_level = wp.LOG_ERROR
+wp.init()
+wp.set_module_options({"enable_backward": False})
+
+real = wp.float64
+vec = wp.vec3d
+Stack = wp.types.vector(length=STACK_SIZE, dtype=wp.int32)
+Reach = wp.types.vector(length=STACK_SIZE, dtype=wp.float64)
+Numbers = wp.array(dtype=wp.float64)
+Numbers2 = wp.array2d(dtype=wp.float64)
+Points = wp.array(dtype=wp.vec3d)
+Points2 = wp.array2d(dtype=wp.vec3d)
+Singles = wp.array(dtype=wp.float32)
+Singles2 = wp.array2d(dtype=wp.float32)
+Labels2 = wp.array2d(dtype=wp.int32)
+Whole = wp.array(dtype=wp.int64)
+Whole2 = wp.array2d(dtype=wp.int64)
+
+ZERO = wp.constant(wp.float64(0.0))
+HALF = wp.constant(wp.float64(0.5))
+ONE = wp.constant(wp.float64(1.0))
+TWO = wp.constant(wp.float64(2.0))
+FAR = wp.constant(wp.float64(math.inf))
+NONE = wp.constant(wp.float64(math.nan))
+PARALLEL = wp.constant(wp.float64(PARALLEL_SHARE))
+SLACK = wp.constant(wp.float64(1e-12))
+
+
+# Distances of primitives.
+
+
+@wp.func
+def segments_d2(p: vec, q: vec, a: vec, b: vec) -> real:
+    """Squared distance of segments p q and a b."""
+    d1 = q - p
+    d2 = b - a
+    r = p - a
+    aa = wp.dot(d1, d1)
+    ee = wp.dot(d2, d2)
+    bb = wp.dot(d1, d2)
+    cc = wp.dot(d1, r)
+    ff = wp.dot(d2, r)
+    aa_safe = wp.where(aa > ZERO, aa, ONE)
+    ee_safe = wp.where(ee > ZERO, ee, ONE)
+    denominator = aa * ee - bb * bb
+    s = real(0.0)
+    if denominator > wp.float64(1e-15) * aa * ee:
+        s = wp.clamp((bb * ff - cc * ee) / denominator, ZERO, ONE)
+    t = wp.clamp((bb * s + ff) / ee_safe, ZERO, ONE)
+    s = wp.clamp((bb * t - cc) / aa_safe, ZERO, ONE)
+    t = wp.clamp((bb * s + ff) / ee_safe, ZERO, ONE)
+    return wp.length_sq(r + s * d1 - t * d2)
+
+
+@wp.func
+def point_triangle_d2(p: vec, a: vec, b: vec, c: vec) -> real:
+    """Squared distance of a point to a triangle: over the face, or to the nearest edge."""
+    n = wp.cross(b - a, c - a)
+    square = wp.dot(n, n)
+    if square > ZERO:
+        v = wp.dot(wp.cross(p - a, c - a), n) / square
+        w = wp.dot(wp.cross(b - a, p - a), n) / square
+        if v >= ZERO and w >= ZERO and v + w <= ONE:
+            height = wp.dot(p - a, n)
+            return height * height / square
+    beside = wp.min(segments_d2(p, p, a, b), segments_d2(p, p, b, c))
+    return wp.min(beside, segments_d2(p, p, c, a))
+
+
+@wp.func
+def line_triangle(p: vec, d: vec, a: vec, b: vec, c: vec) -> real:
+    """Parameter t where p + t d meets a triangle, inf for a miss."""
+    e1 = b - a
+    e2 = c - a
+    h = wp.cross(d, e2)
+    det = wp.dot(e1, h)
+    size = wp.max(wp.abs(e1)) * wp.max(wp.abs(e2)) * wp.max(wp.abs(d))
+    if wp.abs(det) <= PARALLEL * size:
+        return FAR
+    s = p - a
+    u = wp.dot(s, h) / det
+    if u < -SLACK or u > ONE + SLACK:
+        return FAR
+    k = wp.cross(s, e1)
+    v = wp.dot(d, k) / det
+    if v < -SLACK or u + v > ONE + SLACK:
+        return FAR
+    return wp.dot(e2, k) / det
+
+
+@wp.func
+def segment_triangle_d2(p: vec, q: vec, a: vec, b: vec, c: vec, bound2: real) -> real:
+    """Squared distance of a segment to a triangle, 0 if they cross, at most bound2."""
+    n = wp.cross(b - a, c - a)
+    above_p = wp.dot(n, p - a)
+    above_q = wp.dot(n, q - a)
+    nearest = wp.min(wp.abs(above_p), wp.abs(above_q))
+    if above_p * above_q > ZERO:
+        if nearest * nearest >= bound2 * wp.dot(n, n):
+            return bound2
+    else:
+        t = line_triangle(p, q - p, a, b, c)
+        if t >= ZERO and t <= ONE:
+            return ZERO
+    best = wp.min(bound2, point_triangle_d2(p, a, b, c))
+    best = wp.min(best, point_triangle_d2(q, a, b, c))
+    best = wp.min(best, segments_d2(p, q, a, b))
+    best = wp.min(best, segments_d2(p, q, b, c))
+    return wp.min(best, segments_d2(p, q, c, a))
+
+
+@wp.func
+def box_d2(low: vec, high: vec, lower: vec, upper: vec) -> real:
+    """Squared distance of two boxes."""
+    gap = wp.max(wp.max(lower - high, low - upper), vec(ZERO, ZERO, ZERO))
+    return wp.dot(gap, gap)
+
+
+@wp.func
+def capsule_entry(origin: vec, d: vec, a: vec, b: vec, radius: real) -> real:
+    """Distance along a ray to capsule a b, inf for a miss; see `rays.capsule_entry`."""
+    u = b - a
+    length = wp.length(u)
+    if length > ZERO:
+        u = u / length
+    w = origin - a
+    height = wp.dot(w, u)
+    along = wp.dot(d, u)
+    f = w - height * u
+    g = d - along * u
+    away = w - wp.clamp(height, ZERO, length) * u
+    if wp.dot(away, away) <= radius * radius:
+        return ZERO
+    best = real(FAR)
+    slope = wp.dot(g, g)
+    if slope > wp.float64(1e-24):
+        t = -wp.dot(f, g) / slope
+        m = f + t * g
+        half = radius * radius - wp.dot(m, m)
+        if half >= ZERO:
+            t = t - wp.sqrt(half / slope)
+            at = height + t * along
+            if t >= ZERO and at >= ZERO and at <= length:
+                best = t
+    for end in range(2):
+        c = w - wp.float64(end) * length * u
+        t = -wp.dot(c, d)
+        m = c + t * d
+        half = radius * radius - wp.dot(m, m)
+        if half >= ZERO:
+            t = t - wp.sqrt(half)
+            if t >= ZERO and t < best:
+                best = t
+    return best
+
+
+# Walks through the tree of a body's faces.
+
+
+@wp.func
+def segment_surface_d2(
+    p: vec, q: vec, bound2: real, faces: Points2, starts: Whole, lower: Points, upper: Points
+) -> real:
+    """Squared distance of a segment (a point, if p is q) to the surface, at most bound2."""
+    low = wp.min(p, q)
+    high = wp.max(p, q)
+    leaves = starts.shape[0] - 1
+    nodes = Stack()
+    reach = Reach()
+    size = int(1)
+    reach[0] = box_d2(low, high, lower[0], upper[0])
+    best = real(bound2)
+    while size > 0:
+        size = size - 1
+        node = nodes[size]
+        if reach[size] < best:
+            if node >= leaves - 1:
+                leaf = node - (leaves - 1)
+                for k in range(int(starts[leaf]), int(starts[leaf + 1])):
+                    best = segment_triangle_d2(p, q, faces[k, 0], faces[k, 1], faces[k, 2], best)
+            else:
+                one = 2 * node + 1
+                two = 2 * node + 2
+                to_one = box_d2(low, high, lower[one], upper[one])
+                to_two = box_d2(low, high, lower[two], upper[two])
+                if to_one < to_two:  # the nearer one is taken first, from the top of the stack
+                    nodes[size] = two
+                    reach[size] = to_two
+                    nodes[size + 1] = one
+                    reach[size + 1] = to_one
+                else:
+                    nodes[size] = one
+                    reach[size] = to_one
+                    nodes[size + 1] = two
+                    reach[size + 1] = to_two
+                size = size + 2
+    return best
+
+
+@wp.func
+def crossings(p: vec, q: vec, faces: Points2, starts: Whole, lower: Points, upper: Points) -> int:
+    """How many faces a segment crosses."""
+    low = wp.min(p, q)
+    high = wp.max(p, q)
+    leaves = starts.shape[0] - 1
+    nodes = Stack()
+    size = int(1)
+    count = int(0)
+    while size > 0:
+        size = size - 1
+        node = nodes[size]
+        if box_d2(low, high, lower[node], upper[node]) <= ZERO:
+            if node >= leaves - 1:
+                leaf = node - (leaves - 1)
+                for k in range(int(starts[leaf]), int(starts[leaf + 1])):
+                    t = line_triangle(p, q - p, faces[k, 0], faces[k, 1], faces[k, 2])
+                    if t >= ZERO and t <= ONE:
+                        count = count + 1
+            else:
+                nodes[size] = 2 * node + 1
+                nodes[size + 1] = 2 * node + 2
+                size = size + 2
+    return count
+
+
+@wp.func
+def box_entry(p: vec, inverse: vec, lower: vec, upper: vec) -> real:
+    """Where a ray enters a box, inf for a miss; rounding may not lose a box that it grazes."""
+    one = wp.cw_mul(lower - p, inverse)
+    two = wp.cw_mul(upper - p, inverse)
+    first = wp.max(wp.min(one, two))
+    last = wp.min(wp.max(one, two))
+    if first <= last + wp.float64(1e-9) and last >= wp.float64(-1e-9):
+        return wp.max(first, ZERO) - wp.float64(1e-9)
+    return FAR
+
+
+@wp.func
+def field_at(values: wp.array3d(dtype=wp.float32), origin: vec, cell: real, p: vec) -> real:
+    """Trilinear value (mm) of a distance field at a point, inf outside the grid."""
+    x = (p - origin) / cell
+    for axis in range(3):
+        if not (x[axis] >= ZERO and x[axis] < wp.float64(values.shape[axis] - 1)):
+            return FAR
+    i = int(x[0])
+    j = int(x[1])
+    k = int(x[2])
+    u = x[0] - wp.float64(i)
+    v = x[1] - wp.float64(j)
+    w = x[2] - wp.float64(k)
+    total = real(0.0)
+    for corner in range(8):
+        di = corner >> 2
+        dj = (corner >> 1) & 1
+        dk = corner & 1
+        share = wp.where(di == 1, u, ONE - u) * wp.where(dj == 1, v, ONE - v)
+        share = share * wp.where(dk == 1, w, ONE - w)
+        total = total + share * wp.float64(values[i + di, j + dj, k + dk])
+    return total
+
+
+@wp.func
+def is_inside(
+    p: vec,
+    depth: real,
+    values: wp.array3d(dtype=wp.float32),
+    origin: vec,
+    cell: real,
+    faces: Points2,
+    starts: Whole,
+    lower: Points,
+    upper: Points,
+) -> bool:
+    """Whether p, at a known distance from a closed surface, is inside; see `distance`."""
+    x = (p - origin) / cell
+    i = int(wp.rint(x[0]))
+    j = int(wp.rint(x[1]))
+    k = int(wp.rint(x[2]))
+    q = origin + cell * vec(wp.float64(i), wp.float64(j), wp.float64(k))
+    inside = values[i, j, k] < wp.float32(0.0)
+    if depth * depth > wp.length_sq(q - p):
+        return inside
+    if crossings(p, q, faces, starts, lower, upper) % 2 == 1:
+        return not inside
+    return inside
+
+
+@wp.kernel
+def chains_to_surface(
+    lines: Points2,
+    given: wp.array(dtype=wp.bool),
+    turns: wp.array(dtype=wp.mat33d),
+    shifts: Points,
+    radius: real,
+    within: real,
+    horizon: real,
+    closed: int,
+    values: wp.array3d(dtype=wp.float32),
+    origin: vec,
+    cell: real,
+    band: real,
+    slack: real,
+    faces: Points2,
+    starts: Whole,
+    lower: Points,
+    upper: Points,
+    at_points: Numbers2,
+    out: Numbers,
+):
+    """Clearance of arm `tid` from a body; at_points (B, K) is working memory. See `distance`."""
+    b = wp.tid()
+    pose = wp.where(turns.shape[0] > 1, b, 0)
+    turn = turns[pose]
+    shift = shifts[pose]
+    count = lines.shape[1]
+    estimate = real(FAR)
+    lowest = real(FAR)
+    first = int(0)
+    finite = bool(True)
+    before = vec(ZERO, ZERO, ZERO)
+    for k in range(count):
+        p = turn * lines[b, k] + shift
+        finite = finite and wp.isfinite(p[0]) and wp.isfinite(p[1]) and wp.isfinite(p[2])
+        value = field_at(values, origin, cell, p)
+        at_points[b, k] = value
+        estimate = wp.min(estimate, wp.where(given[k], value, wp.abs(value)))
+        if k > 0:
+            ends = wp.min(at_points[b, k - 1], band) + wp.min(value, band)
+            low = HALF * (ends - wp.length(p - before)) - slack
+            if low < lowest:
+                lowest = low
+                first = k - 1
+        before = p
+    if not finite:
+        out[b] = NONE
+        return
+    if lowest - radius <= within:
+        best = wp.min(estimate + slack, horizon + radius)
+        # The segment with the smallest lower bound goes first: it rules out most of the others.
+        for n in range(count - 1):
+            k = (first + n) % (count - 1)
+            p = turn * lines[b, k] + shift
+            q = turn * lines[b, k + 1] + shift
+            ends = wp.min(at_points[b, k], band) + wp.min(at_points[b, k + 1], band)
+            low = HALF * (ends - wp.length(q - p)) - slack
+            if low < best and best > ZERO:
+                d2 = segment_surface_d2(p, q, best * best, faces, starts, lower, upper)
+                best = wp.min(best, wp.sqrt(d2))
+        if closed == 1:
+            for k in range(count):
+                if given[k] and at_points[b, k] - slack < wp.min(best, ZERO):
+                    p = turn * lines[b, k] + shift
+                    bound = wp.abs(at_points[b, k]) + slack
+                    d2 = segment_surface_d2(p, p, bound * bound, faces, starts, lower, upper)
+                    depth = wp.sqrt(d2)
+                    if is_inside(p, depth, values, origin, cell, faces, starts, lower, upper):
+                        best = wp.min(best, -depth)
+        estimate = best
+    out[b] = wp.min(estimate - radius, horizon)
+
+
+@wp.kernel
+def rays_to_surface(
+    origins: Points,
+    directions: Points,
+    range_mm: real,
+    faces: Points2,
+    starts: Whole,
+    order: Whole,
+    lower: Points,
+    upper: Points,
+    distance: Numbers,
+    face: Whole,
+):
+    """Distance and face of ray `tid`, in the body's frame; range_mm and -1 for a miss."""
+    n = wp.tid()
+    p = origins[n]
+    d = directions[n]
+    best = real(range_mm)
+    found = int(-1)
+    sum_of_all = wp.dot(p, vec(ONE, ONE, ONE)) + wp.dot(d, vec(ONE, ONE, ONE))
+    if wp.isfinite(sum_of_all):
+        inverse = vec(FAR, FAR, FAR)
+        for axis in range(3):
+            inverse[axis] = wp.where(d[axis] == ZERO, wp.float64(1e300), ONE / d[axis])
+        leaves = starts.shape[0] - 1
+        nodes = Stack()
+        entry = Reach()
+        size = int(1)
+        entry[0] = box_entry(p, inverse, lower[0], upper[0])
+        while size > 0:
+            size = size - 1
+            node = nodes[size]
+            if entry[size] <= best:
+                if node >= leaves - 1:
+                    leaf = node - (leaves - 1)
+                    for k in range(int(starts[leaf]), int(starts[leaf + 1])):
+                        t = line_triangle(p, d, faces[k, 0], faces[k, 1], faces[k, 2])
+                        if t >= ZERO and t < best:
+                            best = t
+                            found = k
+                else:
+                    one = 2 * node + 1
+                    two = 2 * node + 2
+                    to_one = box_entry(p, inverse, lower[one], upper[one])
+                    to_two = box_entry(p, inverse, lower[two], upper[two])
+                    if to_one < to_two:
+                        nodes[size] = two
+                        entry[size] = to_two
+                        nodes[size + 1] = one
+                        entry[size + 1] = to_one
+                    else:
+                        nodes[size] = one
+                        entry[size] = to_one
+                        nodes[size + 1] = two
+                        entry[size + 1] = to_two
+                    size = size + 2
+    distance[n] = best
+    face[n] = wp.int64(-1)
+    if found >= 0:
+        face[n] = order[found]
+
+
+@wp.kernel
+def chains_apart(first: Points2, second: Points2, radii: real, horizon: real, out: Numbers):
+    """Clearance (mm) of the two arms of environment `tid`."""
+    b = wp.tid()
+    best = horizon + radii
+    finite = real(0.0)
+    for k in range(first.shape[1]):
+        finite = finite + wp.dot(first[b, k], vec(ONE, ONE, ONE))
+    for k in range(second.shape[1]):
+        finite = finite + wp.dot(second[b, k], vec(ONE, ONE, ONE))
+    if not wp.isfinite(finite):
+        out[b] = NONE
+        return
+    for i in range(first.shape[1] - 1):
+        p = first[b, i]
+        q = first[b, i + 1]
+        half = HALF * wp.length(q - p)
+        for j in range(second.shape[1] - 1):
+            c = second[b, j]
+            d = second[b, j + 1]
+            reach = best + half + HALF * wp.length(d - c)
+            if wp.length_sq(HALF * (p + q - c - d)) < reach * reach:
+                best = wp.min(best, wp.sqrt(segments_d2(p, q, c, d)))
+    out[b] = best - radii
+
+
+@wp.kernel
+def chains_folded(lines: Points2, radius: real, gap: real, horizon: real, out: Numbers):
+    """Clearance (mm) of the arm of environment `tid` to itself beyond `gap` mm of arc."""
+    b = wp.tid()
+    segments = lines.shape[1] - 1
+    total = real(0.0)
+    for k in range(segments):
+        total = total + wp.length(lines[b, k + 1] - lines[b, k])
+    if not wp.isfinite(total):
+        out[b] = NONE
+        return
+    best = horizon + TWO * radius
+    for i in range(segments):
+        p = lines[b, i]
+        q = lines[b, i + 1]
+        half = HALF * wp.length(q - p)
+        between = real(0.0)
+        for j in range(i + 1, segments):
+            c = lines[b, j]
+            d = lines[b, j + 1]
+            length = wp.length(d - c)
+            if between >= gap:
+                reach = best + half + HALF * length
+                if wp.length_sq(HALF * (p + q - c - d)) < reach * reach:
+                    best = wp.min(best, wp.sqrt(segments_d2(p, q, c, d)))
+            between = between + length
+    out[b] = best - TWO * radius
+
+
+@wp.kernel
+def rays_to_chains(
+    origins: Points2,
+    directions: Points2,
+    lines: Points2,
+    radius: real,
+    gap: real,
+    distance: Numbers2,
+    segment: Whole2,
+):
+    """First hit of ray r on the arm of environment b, where it is nearer than `distance`."""
+    b, r = wp.tid()
+    o = origins[b, r]
+    d = directions[b, r]
+    best = distance[b, r]
+    found = int(-1)
+    arc = real(0.0)
+    for turn in range(lines.shape[1] - 1):
+        k = lines.shape[1] - 2 - turn
+        p = lines[b, k]
+        q = lines[b, k + 1]
+        length = wp.length(q - p)
+        if arc >= gap:
+            away = HALF * (p + q) - o
+            away = away - wp.max(ZERO, wp.dot(away, d)) * d
+            reach = radius + HALF * length + wp.float64(1e-9)
+            if wp.length_sq(away) <= reach * reach:
+                t = capsule_entry(o, d, p, q, radius)
+                if t < best or (found >= 0 and t == best):  # of several the one nearest to the base
+                    best = t
+                    found = k
+        arc = arc + length
+    if found >= 0:
+        distance[b, r] = best
+        segment[b, r] = wp.int64(found)
+
+
+@wp.kernel
+def deposit(
+    began: Points,
+    ended: Points,
+    direction: Points,
+    energy: Singles,
+    ring: Whole,
+    waist: real,
+    reach: real,
+    steepest: real,
+    counted: Numbers,
+    points: Points,
+    normals: Points,
+    areas: Numbers,
+    zones: Labels2,
+    stations: Labels2,
+    origin: vec,
+    cell: real,
+    cells: wp.vec3i,
+    starts: Whole,
+    dose: Singles2,
+    peak: Singles2,
+    band: Singles2,
+    area: Singles2,
+    joule: Singles2,
+    in_ring: int,
+):
+    """Add the sweep of environment `tid` to the samples near its path; see `ablation._deposit`.
+
+    in_ring: number of the zone that is the ring.
+    """
+    n = wp.tid()
+    if not energy[n] > wp.float32(0.0):
+        return
+    scale = wp.sqrt(TWO) / waist
+    p = began[n]
+    d = direction[n]
+    low = wp.vec3i(0, 0, 0)
+    high = wp.vec3i(0, 0, 0)
+    for axis in range(3):
+        tall = reach * (ONE + wp.abs(d[axis]) / steepest)
+        near = wp.min(p[axis], ended[n][axis]) - tall - origin[axis]
+        far = wp.max(p[axis], ended[n][axis]) + tall - origin[axis]
+        low[axis] = wp.max(0, int(wp.floor(wp.max(near / cell, wp.float64(-1.0)))))
+        high[axis] = wp.min(
+            cells[axis] - 1, int(wp.floor(wp.clamp(far / cell, wp.float64(-2.0), wp.float64(1e6))))
+        )
+    m = ended[n] - p
+    m = m - wp.dot(m, d) * d
+    length = wp.length(m)
+    moving = length > wp.float64(1e-5) * waist
+    m = wp.where(moving, m / wp.max(length, wp.float64(1e-300)), vec(ZERO, ZERO, ZERO))
+    strength = TWO * wp.float64(energy[n]) / (wp.float64(wp.pi) * waist * waist)
+    for ci in range(low[0], high[0] + 1):
+        for cj in range(low[1], high[1] + 1):
+            for ck in range(low[2], high[2] + 1):
+                cube = (ci * cells[1] + cj) * cells[2] + ck
+                middle = vec(wp.float64(ci) + HALF, wp.float64(cj) + HALF, wp.float64(ck) + HALF)
+                x = origin + cell * middle - p
+                along = wp.clamp(wp.dot(x, m), ZERO, length)
+                x = x - wp.dot(x, d) * d - along * m
+                wide = reach + wp.float64(0.87) * cell
+                if wp.length_sq(x) <= wide * wide:
+                    for s in range(int(starts[cube]), int(starts[cube + 1])):
+                        cosine = -wp.dot(d, normals[s])
+                        if cosine > ZERO:
+                            y = points[s] - p
+                            y = y - wp.dot(y, d) * d
+                            way = wp.dot(y, m)
+                            across2 = wp.dot(y, y) - way * way
+                            beside = across2 > reach * reach
+                            if not (beside or way < -reach or way > length + reach):
+                                profile = wp.exp(-scale * scale * wp.max(across2, ZERO))
+                                if moving:
+                                    span = wp.erf(scale * way) - wp.erf(scale * (way - length))
+                                    root = wp.sqrt(wp.float64(wp.pi))
+                                    profile = profile * HALF * root * span / (scale * length)
+                                gain = strength * profile * cosine
+                                old = wp.float64(dose[n, s])
+                                after = old + gain
+                                kind = zones[int(ring[n]), s]
+                                station = stations[int(ring[n]), s]
+                                joule[n, kind] = wp.float32(
+                                    wp.float64(joule[n, kind]) + gain * areas[s]
+                                )
+                                if after >= counted[kind] and old < counted[kind]:
+                                    area[n, kind] = area[n, kind] + wp.float32(areas[s])
+                                    if kind == in_ring:
+                                        band[n, station] = band[n, station] + wp.float32(areas[s])
+                                if kind == in_ring and after > wp.float64(peak[n, station]):
+                                    peak[n, station] = wp.float32(after)
+                                dose[n, s] = wp.float32(after)

@@ -123,20 +123,29 @@ def diagnosis(
             min=0, help="Number of cases with one known effect whose model is amended, too."
         ),
     ] = 45,
+    only: Annotated[
+        str,
+        typer.Option(
+            metavar="KIND,...",
+            help="Kinds of cases, with commas: single (one effect of the list is hidden), clean, "
+            "unknown, pair, undertrained. Default: all.",
+        ),
+    ] = "",
     images: Images = None,
     output: Output = None,
 ) -> None:
     """Benchmark of `diagnose` on virtual robots: hidden effects, none, or unknown ones."""
-    from benchmarks.diagnosis.cases import cases
+    from benchmarks.diagnosis.cases import SHARES, cases
     from benchmarks.diagnosis.study import run
     from benchmarks.diagnosis.table import draw, markdown
 
     numbers = _numbers("--robots", robots)
-    some = cases(numbers, count, seed)
+    kinds = tuple(word.strip() for word in only.split(",")) if only else tuple(SHARES)
+    some = cases(numbers, count, seed, kinds)
     with _kept("diagnosis", work) as report:
         outcomes = run(some, work, processes, report, amend)
     command = f"surgisoft benchmark diagnosis --robots {robots} --count {count} --seed {seed}"
-    command += f" --amend {amend}"
+    command += f" --amend {amend}" + (f" --only {only}" if only else "")
     if images:
         print(f"wrote {draw(outcomes, images)}")
     _show("Diagnosis results", command, markdown(outcomes), output)

@@ -4,9 +4,12 @@ Most of the rig's hidden effects have other equations than the model's effects; 
 those whose law the model's effect contains.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
+
+from surgisoft.errors import InputError
 
 KNOWN = {
     "hysteresis": "hysteresis",
@@ -68,6 +71,8 @@ EXCITATIONS = {
     "rich": ("mixed", 12000),
 }
 """Name -> protocol and samples at 20 Hz."""
+SHARES = {"single": 0.5, "clean": 0.25, "unknown": 0.1, "pair": 0.1, "undertrained": 0.05}
+"""Kind of case -> its share of all cases."""
 
 
 @dataclass(frozen=True)
@@ -100,21 +105,34 @@ class Case:
         return len(self.hidden) == 1 and self.truth[0] != "unknown" and not self.undertrained
 
 
-def cases(robots: list[int], count: int, seed: int) -> list[Case]:
-    """About `count` robots: half with one hidden effect, and clean, unknown, two, undertrained."""
+def cases(
+    robots: list[int], count: int, seed: int, kinds: Collection[str] = tuple(SHARES)
+) -> list[Case]:
+    """About `count` cases: half with one hidden effect, and clean, unknown, two, undertrained.
+
+    kinds: names of `SHARES`; where some are left out, the shares of the others grow in proportion.
+    Raises InputError for another name.
+    """
+    for kind in kinds:
+        if kind not in SHARES:
+            raise InputError(f"kind of case '{kind}': expected one of {', '.join(SHARES)}")
+    whole = sum(SHARES[kind] for kind in SHARES if kind in kinds)
+
+    def number(kind: str) -> int:
+        return round(SHARES[kind] / whole * count) if kind in kinds else 0
+
     rng = np.random.default_rng(seed)
     single = [((name, float(strength)),) for strength in (1.0, 2.0, 0.6) for name in KNOWN]
     plan: list[tuple[tuple, bool]] = []
-    shares = {"single": 0.5, "clean": 0.25, "unknown": 0.1, "pair": 0.1, "undertrained": 0.05}
-    for i in range(round(shares["single"] * count)):
+    for i in range(number("single")):
         plan.append((single[i % len(single)], False))
-    plan += [((), False)] * round(shares["clean"] * count)
-    for i in range(round(shares["unknown"] * count)):
+    plan += [((), False)] * number("clean")
+    for i in range(number("unknown")):
         plan.append((((UNKNOWN[i % len(UNKNOWN)], float(rng.choice([1.0, 2.0]))),), False))
-    for i in range(round(shares["pair"] * count)):
+    for i in range(number("pair")):
         pair = PAIRS[i % len(PAIRS)]
         plan.append((tuple((name, 1.2) for name in pair), False))
-    plan += [((), True)] * round(shares["undertrained"] * count)
+    plan += [((), True)] * number("undertrained")
     drawn = []
     for take, (hidden, undertrained) in enumerate(plan):
         drawn.append(

@@ -31,6 +31,7 @@ from surgisoft.diagnosis.diagnose import (
     rivals_of,
 )
 from surgisoft.diagnosis.evidence import EffectEvidence, Evidence
+from surgisoft.errors import InputError
 from surgisoft.rig.hidden import HIDDEN
 from surgisoft.surrogate.checkpoint import DEFAULT_FOLDER, default_arm
 
@@ -107,6 +108,17 @@ def test_cases_are_those_of_their_seed():
     kinds = Counter(len(case.hidden) for case in some)
     assert kinds[2] == 8
     assert sum(not case.hidden and not case.undertrained for case in some) == 20
+
+
+def test_one_kind_of_case_alone():
+    """189 unchanged robots without a name show less than 2 %; a quarter of all cases is clean."""
+    some = cases([1, 2], 40, seed=3, kinds=("clean",))
+    assert len({case.take for case in some}) == 40
+    assert not any(case.hidden or case.undertrained for case in some)
+    two = cases([1, 2], 40, seed=3, kinds=("unknown", "pair"))
+    assert Counter(len(case.hidden) for case in two) == {1: 20, 2: 20}
+    with pytest.raises(InputError, match="kind of case 'clear': expected one of single, clean"):
+        cases([1, 2], 40, seed=3, kinds=("clear",))
 
 
 def test_every_hidden_effect_of_the_rig_has_a_place_in_the_cases():

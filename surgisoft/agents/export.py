@@ -89,6 +89,8 @@ def export(
             written.append(fresh / "controller.py")
         except (DoesNotTrace, InputError) as error:
             content |= {"controller": None, "note": str(error)}
+            for file in fresh.glob("controller.*"):  # the one of the two that was written
+                file.unlink()
         write_json(fresh / "policy.json", content)
         names = [*(file.name for file in written), "policy.json"]
     return [folder / name for name in names]
@@ -257,7 +259,6 @@ def _controller(graph: ControllerGraph, folder: Path) -> None:
             graph, write(folder / name), _samples(graph), states=1, compared_states=False
         )
         if not worst <= CONTROLLER_TOLERANCE:
-            (folder / name).unlink()
             raise DoesNotTrace(
                 f"controller: {name} differs by {worst:.2g} from the policy; an effect or a task "
                 "that branches on values cannot be exported"

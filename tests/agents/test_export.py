@@ -230,6 +230,53 @@ def test_the_policy_itself_departs_after_one_command_was_rounded_otherwise(ring)
     assert found.explains(Differences(0.1, 0.1))
 
 
+def wrong_files(monkeypatch, off, wrong):
+    """Let export write empty files instead of graphs, of which some answer `off` too much."""
+
+    def written(module, example, file, *names, **options):
+        file.write_bytes(b"")
+        more = off if file.name in wrong else 0.0
+
+        def answer(*given):
+            found = module(*given)
+            if isinstance(found, tuple):  # a controller: the state, then what it commands
+                return (found[0], *(each + more for each in found[1:]))
+            return found + more
+
+        return answer
+
+    monkeypatch.setattr(exporting, "write_torch_script", written)
+    monkeypatch.setattr(exporting, "write_onnx", written)
+    monkeypatch.setattr(exporting, "CHECKED", 8)
+
+
+@pytest.mark.parametrize("name", ["arm.pt", "arm.onnx"])
+def test_a_network_whose_file_computes_otherwise_is_not_exported(
+    policy, tmp_path, monkeypatch, name
+):
+    """More than 1e-5 kPa at any of 64 observations; nothing is left behind."""
+    wrong_files(monkeypatch, 2e-5, [name])
+    with pytest.raises(RuntimeError, match=rf"{name}: actions differ by \S+ kPa from the policy's"):
+        export(policy, tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["controller.pt", "controller.onnx"])
+@pytest.mark.parametrize(("off", "kept"), [(2e-4, False), (np.nan, False), (2e-5, True)])
+def test_a_controller_whose_file_computes_otherwise_is_not_exported(
+    policy, tmp_path, monkeypatch, name, off, kept
+):
+    """More than 1e-4 of any unit in 8 samples: the policies are exported, and the reason said."""
+    wrong_files(monkeypatch, off, [name])
+    written = {file.name for file in export(policy, tmp_path / "out")}
+    about = json.loads((tmp_path / "out" / "policy.json").read_text())
+    assert ("controller.py" in written) is kept
+    assert (about["controller"] is not None) is kept
+    assert len([*(tmp_path / "out").glob("controller.*")]) == 3 * kept
+    if not kept:
+        assert about["note"].startswith(f"controller: {name} differs by ")
+
+
 def test_policy_json_names_every_entry_of_the_observation(policy, exported):
     about = json.loads((exported / "policy.json").read_text())
     blocks = about["observations"]["arm"]

@@ -1,6 +1,7 @@
 """`InputError`, the one error type for bad input from outside: files, options, names."""
 
 from collections.abc import Iterable
+from typing import Any
 
 LONGEST = 1000
 """Characters of a message; of a longer one the middle is left out."""
@@ -15,6 +16,18 @@ class InputError(ValueError):
 
     def __init__(self, message: str):
         super().__init__(one_line(message))
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C ended work of which a part was finished before.
+
+    `result` is that part, of the kind that the function returns; it says what is missing. Like any
+    KeyboardInterrupt it ends a loop over several calls, unless the caller catches it.
+    """
+
+    def __init__(self, result: Any):
+        super().__init__()
+        self.result = result
 
 
 def one_line(text: str) -> str:

@@ -68,6 +68,11 @@ class Evaluation:
     checks: list[EpisodeCheck] | None
     """Exact collision checks of each episode; None where there were none."""
 
+    @property
+    def episodes(self) -> int:
+        """Number N of episodes."""
+        return len(next(iter(self.per_episode.values())))
+
     def to_json(self) -> dict:
         """Numbers and lists for JSON; what does not apply is null."""
         document = {
@@ -110,15 +115,37 @@ def evaluate(
     exact collision checker (FCL) where the task has obstacles. batch, progress, watch: as for
     `rollout`. without: measures that are left out of the numbers.
     """
-    exactly = ExactChecks(task) if exact and has_obstacles(task) else None
-    watchers = [each for each in (exactly, watch) if each is not None]
+    exactly = exact_checks_of(task, exact)
+    watcher = watched_by(exactly, watch)
+    result = rollout(task, policy, episodes, seed, batch, progress, watcher)
+    return summarised(task, name, result, exactly, without)
+
+
+def exact_checks_of(task: Task, exact: bool) -> ExactChecks | None:
+    """The exact checks of a rollout, if they are asked for and the task has obstacles."""
+    return ExactChecks(task) if exact and has_obstacles(task) else None
+
+
+def watched_by(*watchers: Callable[[Instant], None] | None) -> Callable[[Instant], None] | None:
+    """One function for `rollout(watch=...)` that calls those that are not None."""
+    given = [each for each in watchers if each is not None]
 
     def see(now: Instant) -> None:
-        for each in watchers:
+        for each in given:
             each(now)
 
-    result = rollout(task, policy, episodes, seed, batch, progress, see if watchers else None)
-    checks = exactly.checks() if exactly else None
+    return see if given else None
+
+
+def summarised(
+    task: Task,
+    name: str,
+    result: Rollout,
+    exactly: ExactChecks | None,
+    without: Collection[str] = (),
+) -> Evaluation:
+    """The numbers of a rollout that begins with episode 0; exactly: what watched it."""
+    checks = exactly.checks(result.episodes) if exactly else None
     table = episode_table(task, result, checks)
     table = {key: values for key, values in table.items() if key not in without}
     overall = {key: summary(values, key in RATES) for key, values in table.items()}

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from surgisoft.agents.evaluate import RATES, Evaluation, Summary
 from surgisoft.agents.report_charts import episode_charts, spread_chart
+from surgisoft.errors import counted
 from surgisoft.report import Facts, Gallery, Page, Picture, Section, Table, Text
 from surgisoft.tasks.episodes.log import EpisodeLog
 
@@ -107,9 +108,11 @@ def verdict(task: str, results: Sequence[Evaluation]) -> str:
         if error is not None and error.episodes:
             words.append(f"mean error {error.mean:.3g} mm")
         parts.append(f"{Path(result.policy).name}: {', '.join(words) or 'see the table'}")
-    episodes = len(next(iter(results[0].per_episode.values())))
-    plural = "s" if episodes > 1 else ""
-    return f"Task {task}, {episodes} episode{plural} each. {'; '.join(parts)}."
+    counts = [result.episodes for result in results]
+    episodes = f"{counted(counts[0], 'episode')} each"
+    if len(set(counts)) > 1:
+        episodes = f"{' and '.join(map(str, counts))} episodes"
+    return f"Task {task}, {episodes}. {'; '.join(parts)}."
 
 
 def cell(value: Summary | None, rate: bool) -> str:

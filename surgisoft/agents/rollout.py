@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from surgisoft.agents.policies import Policy
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, Interrupted
 from surgisoft.progress import Progress, silent
 from surgisoft.tasks.base import Episodes, Outcome, Task, TaskState
 from surgisoft.tasks.episodes.log import EpisodeLog, EpisodeRecorder
@@ -115,15 +115,17 @@ def rollout(
     """Roll out episodes `first` to `first + episodes - 1` of a seed with a policy.
 
     batch: how many run side by side, which changes no result. progress: called with the steps done
-    and the most that may be to do. watch: called with every instant.
+    and the most that may be to do. watch: called with every instant. Ctrl-C raises `Interrupted`
+    with the episodes of the batches that were finished, or KeyboardInterrupt in the first one:
+    episodes of an unfinished batch that have ended are those that end early.
     """
     if episodes < 1 or batch < 1:
         raise InputError(f"rollout: {episodes} episodes in batches of {batch}, expected 1 or more")
     parts, total = [], task.steps * -(-episodes // batch)
     for number, done in enumerate(range(0, episodes, batch)):
         count, before = min(batch, episodes - done), number * task.steps
-        parts.append(
-            _rolled_out(
+        try:
+            part = _rolled_out(
                 task,
                 policy,
                 seed,
@@ -132,7 +134,11 @@ def rollout(
                 partial(_report_from, progress, before, total),
                 watch,
             )
-        )
+        except KeyboardInterrupt:
+            if not parts:
+                raise
+            raise Interrupted(joined(parts)) from None
+        parts.append(part)
     return joined(parts)
 
 

@@ -10,14 +10,20 @@ from typing import Any, Protocol
 
 import torch
 
-from surgisoft.agents.evaluate import CONFIDENCE, Evaluation
-from surgisoft.agents.evaluate import evaluate as evaluate_policy
+from surgisoft.agents.evaluate import (
+    CONFIDENCE,
+    Evaluation,
+    exact_checks_of,
+    summarised,
+    watched_by,
+)
+from surgisoft.agents.exact_checks import ExactChecks
 from surgisoft.agents.on_rig import RigConfig, at_benches, on_rig, real_benches
 from surgisoft.agents.policies import POLICIES, Policy, check_policy, open_policy
-from surgisoft.agents.rollout import BATCH, EpisodeRecorders
+from surgisoft.agents.rollout import BATCH, EpisodeRecorders, rollout
 from surgisoft.agents.run_folder import RunFolder
 from surgisoft.config import to_table
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, Interrupted, counted
 from surgisoft.files import with_former_keys
 from surgisoft.progress import Progress, silent
 from surgisoft.scene.folder import Scene, open_scene
@@ -208,6 +214,18 @@ class Evaluations:
     included."""
     success_rule: str = ""
     """What an episode needs to be a success, in words; empty for a task without success."""
+    interrupted: bool = False
+    """Whether Ctrl-C ended the evaluation: results are those of the episodes finished before."""
+
+    @property
+    def interruption(self) -> str:
+        """How many episodes of each policy an interrupted evaluation has, in words; else empty."""
+        if not self.interrupted:
+            return ""
+        done = {result.policy: result.episodes for result in self.results}
+        parts = [f"{Path(name).name} {done.get(name, 0):,}" for name in self.request.policies]
+        of = counted(self.request.episodes, "episode")
+        return f"interrupted; finished of {of} each: {', '.join(parts)}"
 
     def to_json(self) -> dict:
         """Plain values, as `evaluate --json` writes them."""
@@ -221,11 +239,12 @@ class Evaluations:
             "success_rule": self.success_rule or None,
             "seed": asked.seed,
             "episodes": asked.episodes,
+            "interrupted": self.interrupted,
             "dt_s": self.dt_s,
             "confidence": CONFIDENCE,
             "policies": {
                 name: result.to_json()
-                for name, result in zip(asked.policies, self.results, strict=True)
+                for name, result in zip(asked.policies, self.results, strict=not self.interrupted)
             },
         }
         return with_former_keys(values, {"drivers": "policies"})
@@ -250,7 +269,9 @@ def evaluate(
     fields: other fields of `EvaluationRequest`, such as `episodes=100` or `rig=RigConfig(seed=3)`;
     `rules=ExperimentRules.of("liver")` (`surgisoft.experiments.session`) evaluates under the rules
     of an experiment.
-    progress: called with (episodes done, episodes to do, policy).
+    progress: called with (episodes done, episodes to do, policy). Ctrl-C raises `Interrupted`
+    (`surgisoft.errors`) with the policies and batches of episodes that are finished (on a real
+    bench, which is vented first, a batch is one episode), or KeyboardInterrupt where none is.
     """
     given = [policies] if isinstance(policies, str | Path) else policies
     names = tuple(dict.fromkeys(str(name) for name in given))
@@ -259,8 +280,7 @@ def evaluate(
     place = plain if request.rig is None else on_rig(plain, request.rig, on_warning=on_warning)
     if request.rules is not None:
         plain, place = request.rules.over(plain), request.rules.over(place)
-    with at_benches(place):
-        return _evaluated(request, plain, place, config, progress)
+    return _evaluated(request, plain, place, config, progress)
 
 
 def _warm_up(task: Task, policy: Policy) -> None:
@@ -280,42 +300,57 @@ def _evaluated(
 ) -> Evaluations:
     """Roll out every policy of a request on a task that is placed in simulation or on rigs."""
     measured, seed = tuple(real_benches(place)), request.seed or 0
-    opening = open_policy if request.rules is None else request.rules.policy
-    opened = {name: opening(name, place) for name in request.policies}
-    if measured:
-        for policy in opened.values():
-            _warm_up(plain, policy)
     logs = {
         name: EpisodeRecorders(place, name, seed, request.place, only=0) for name in request.log
     }
-    results = []
-    for number, (name, policy) in enumerate(opened.items()):
+    without = () if request.rules is None else request.rules.without
+    results: list[Evaluation] = []
+    checks: list[ExactChecks | None] = []
+    interrupted = False
+    try:
+        with at_benches(place):
+            opening = open_policy if request.rules is None else request.rules.policy
+            opened = {name: opening(name, place) for name in request.policies}
+            if measured:
+                for policy in opened.values():
+                    _warm_up(plain, policy)
+            for number, (name, policy) in enumerate(opened.items()):
 
-        def tell(
-            done: float, total: float, note: str = "", first: int = number, name: str = name
-        ) -> None:
-            progress(first * total + done, len(opened) * total, name)
+                def tell(
+                    done: float, total: float, note: str = "", first: int = number, name: str = name
+                ) -> None:
+                    progress(first * total + done, len(opened) * total, name)
 
-        result = evaluate_policy(
-            place,
-            name,
-            policy,
-            request.episodes,
-            seed,
-            request.exact_checks,
-            batch=1 if measured else BATCH,
-            progress=tell,
-            watch=logs.get(name),
-            without=() if request.rules is None else request.rules.without,
-        )
-        results.append(result)
-    return Evaluations(
+                checks.append(exact_checks_of(place, request.exact_checks))
+                rolled = rollout(
+                    place,
+                    policy,
+                    request.episodes,
+                    seed,
+                    batch=1 if measured else BATCH,
+                    progress=tell,
+                    watch=watched_by(checks[-1], logs.get(name)),
+                )
+                results.append(summarised(place, name, rolled, checks[-1], without))
+    except Interrupted as ended:  # here, and not above, because benches are vented by now
+        interrupted, name = True, request.policies[len(results)]
+        results.append(summarised(place, name, ended.result, checks[-1], without))
+    except KeyboardInterrupt:
+        if not results:
+            raise
+        interrupted = True
+    done = {result.policy for result in results}
+    found = Evaluations(
         request,
         plain.name,
         to_table(config),
         plain.world.config.dt_s,
         tuple(results),
-        {name: each.log(0) for name, each in logs.items()},
+        {name: each.log(0) for name, each in logs.items() if name in done},
         measured,
         rule(config) if (rule := spec_of(plain.name).success_rule) else "",
+        interrupted,
     )
+    if interrupted:
+        raise Interrupted(found)
+    return found

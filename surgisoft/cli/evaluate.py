@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from surgisoft.cli import app
+from surgisoft.cli import INTERRUPTED, app
 from surgisoft.cli.files import check_folder, check_free, check_replay, show_written
 from surgisoft.cli.inputs import warn
 from surgisoft.cli.options import (
@@ -25,7 +25,7 @@ from surgisoft.cli.options import (
     TaskConfig,
 )
 from surgisoft.cli.progress import progress
-from surgisoft.errors import InputError, counted, unknown_name
+from surgisoft.errors import InputError, Interrupted, counted, unknown_name
 from surgisoft.files import write_json
 
 if TYPE_CHECKING:
@@ -104,7 +104,10 @@ def evaluate(
     replay: Replay = None,
     report: Report = None,
 ) -> None:
-    """Evaluate policies on the same episodes of a task, with 95 % intervals."""
+    """Evaluate policies on the same episodes of a task, with 95 % intervals.
+
+    Ctrl-C keeps what is finished: policies, and batches of 256 episodes (on a real rig, episodes).
+    """
     check_free(json_file, "policies", "drivers")
     check_replay(replay)
     check_folder(report)
@@ -120,22 +123,28 @@ def evaluate(
         laid = ExperimentRules.of(rules)
 
     with progress("evaluate") as report_progress:
-        found = evaluate_policies(
-            policies,
-            task,
-            progress=report_progress,
-            on_warning=warn,
-            episodes=episodes,
-            seed=seed,
-            rig=rigs,
-            exact_checks=exact_checks,
-            arm=arm,
-            scene=scene,
-            config=config,
-            rules=laid,
-            log=policies if report else policies[:1] if replay else (),
-        )
+        try:
+            found = evaluate_policies(
+                policies,
+                task,
+                progress=report_progress,
+                on_warning=warn,
+                episodes=episodes,
+                seed=seed,
+                rig=rigs,
+                exact_checks=exact_checks,
+                arm=arm,
+                scene=scene,
+                config=config,
+                rules=laid,
+                log=policies if report else policies[:1] if replay else (),
+            )
+        except Interrupted as ended:
+            found = ended.result
+            warn(f"{found.interruption}; writing their results (Ctrl-C again ends at once)")
     about = f"{counted(episodes, 'episode')} of seed {found.request.seed}"
+    if found.interrupted:
+        about += f"; {found.interruption}"
     written: list[object] = []
     if json_file:
         write_json(json_file, found.to_json())
@@ -163,6 +172,8 @@ def evaluate(
             "errors are those of the measured key points, camera noise included"
         )
     show_written(written)
+    if found.interrupted:
+        raise typer.Exit(INTERRUPTED)
 
 
 def _rig_config(

@@ -5,8 +5,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from surgisoft.cli import app
-from surgisoft.cli.inputs import read_recordings
+from surgisoft.cli import INTERRUPTED, app
+from surgisoft.cli.inputs import read_recordings, warn
 from surgisoft.cli.options import (
     SEED_MAX,
     EffectFiles,
@@ -16,6 +16,7 @@ from surgisoft.cli.options import (
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
+from surgisoft.errors import Interrupted
 
 
 @app.command()
@@ -94,7 +95,8 @@ def fit(
 
     Forward selection from pressure to effects to direction: an addition is accepted only if it
     lowers the held-out error significantly. Inputs that the recordings cannot identify are left
-    out and reported.
+    out and reported. Ctrl-C keeps the best model so far, and its report.json says where the fit was
+    interrupted; before the first validation nothing is written.
     """
     train = read_recordings(recordings)
     held = read_recordings(valid) if valid else None
@@ -105,26 +107,32 @@ def fit(
 
     claim_folder(output, force)
     with progress("fit") as report:
-        result = fit_model(
-            train,
-            held,
-            actuation=actuation,
-            threads=threads,
-            progress=lambda stage, epoch, of, loss: report(
-                epoch, of, f"{stage}: held-out {loss:.4f} mm2"
-            ),
-            network=network,
-            inputs=inputs,
-            effects=[name for item in effects or [] for name in item.split(",")],
-            hidden=parse_widths(widths),
-            prior=prior,
-            members=members,
-            epochs=epochs,
-            seed=seed,
-        )
+        try:
+            result = fit_model(
+                train,
+                held,
+                actuation=actuation,
+                threads=threads,
+                progress=lambda stage, epoch, of, loss: report(
+                    epoch, of, f"{stage}: held-out {loss:.4f} mm2"
+                ),
+                network=network,
+                inputs=inputs,
+                effects=[name for item in effects or [] for name in item.split(",")],
+                hidden=parse_widths(widths),
+                prior=prior,
+                members=members,
+                epochs=epochs,
+                seed=seed,
+            )
+        except Interrupted as ended:
+            result = ended.result
     save_model(result.model, output, result.report(), force)
     for line in result.lines():
         print(line)
     print(f"wrote {output}: {result.model.summary()}")
+    if result.interrupted is not None:
+        warn(result.interrupted.sentence)
+        raise typer.Exit(INTERRUPTED)
     following = with_effect_files(f"surgisoft compare {output} TEST.parquet --test --report PAGE")
     print(f"next, its error on an unseen recording: {following}")

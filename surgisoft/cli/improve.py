@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from surgisoft.cli import app
+from surgisoft.cli import INTERRUPTED, app
 from surgisoft.cli.amended import (
     NOT_CLAIMED,
     claim_other_folder,
@@ -12,7 +12,7 @@ from surgisoft.cli.amended import (
     write_before_and_after,
 )
 from surgisoft.cli.files import check_folder, check_free, check_replay, show_written
-from surgisoft.cli.inputs import check_model, read_before, read_recordings, warn_all
+from surgisoft.cli.inputs import check_model, read_before, read_recordings, warn, warn_all
 from surgisoft.cli.options import (
     REFIT_PROCESSES,
     Before,
@@ -30,6 +30,7 @@ from surgisoft.cli.options import (
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
+from surgisoft.errors import Interrupted
 from surgisoft.files import write_json
 
 
@@ -55,7 +56,8 @@ def improve(
 
     The result is validated on the last quarter of each recording. Where no effect was added, or
     the error did not fall significantly, nothing is written (exit code 1). With --before, what
-    has changed since is named and added, and the network stays as it is.
+    has changed since is named and added, and the network stays as it is. Ctrl-C keeps the rounds
+    that are finished: their model, report and errors.
     """
     check_free(json_file, "rounds")
     check_folder(report)
@@ -75,18 +77,22 @@ def improve(
             done.append(each)
             tell(len(done), most + 2, each.step or each.verdict)
 
-        result = improve_model(
-            model,
-            measured,
-            most,
-            after,
-            refit=refit,
-            refit_progress=tell,
-            processes=REFIT_PROCESSES,
-            error_mm=model_error,
-            before=earlier,
-            paired=paired,
-        )
+        try:
+            result = improve_model(
+                model,
+                measured,
+                most,
+                after,
+                refit=refit,
+                refit_progress=tell,
+                processes=REFIT_PROCESSES,
+                error_mm=model_error,
+                before=earlier,
+                paired=paired,
+            )
+        except Interrupted as ended:
+            result = ended.result
+            warn("interrupted; writing the rounds that are finished (Ctrl-C again ends at once)")
     warn_all(result.notes)
     written = []
     if result.claimed:
@@ -111,8 +117,13 @@ def improve(
     print(result.sentence)
     if not result.claimed:
         print(f"{output} was not written")
-        raise typer.Exit(NOT_CLAIMED)
+        raise typer.Exit(INTERRUPTED if result.interrupted else NOT_CLAIMED)
     print(f"wrote {output}: {result.model.summary()}")
+    if result.interrupted:
+        files = " ".join(map(str, recordings))
+        following = with_effect_files(f"surgisoft improve {output} {files} -o OTHER")
+        print(f"next, to seek further effects: {following}")
+        raise typer.Exit(INTERRUPTED)
     known = result.model.fitted_rows
     test = "TEST.parquet --test" if known is not None and known.complete else "TEST.parquet"
     following = with_effect_files(f"surgisoft compare {model} {output} {test} --report PAGE")
@@ -123,6 +134,7 @@ def _show(result) -> None:
     """Print each round, then the parameters and the errors on the held-out part."""
     for number, done in enumerate(result.rounds, 1):
         what = f"+ {done.step}" if done.step else "no further effect"
+        what = "interrupted" if done.verdict == "interrupted" else what
         what += ", fitted together with the network" if done.together else ""
         competing = f" (or {', '.join(done.competing)})" if done.competing else ""
         print(f"round {number}: {done.verdict}: {done.sentence}")

@@ -25,7 +25,7 @@ from surgisoft.diagnosis.pairs import Change, Paired, before_and_after
 from surgisoft.diagnosis.refit import JointFit, apart_mm, fit_together
 from surgisoft.diagnosis.residuals import Sealed, model_discrepancy, residual_table
 from surgisoft.diagnosis.setup import find_setup_faults
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, Interrupted
 from surgisoft.files import with_former_keys
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.progress import Progress as RefitProgress
@@ -44,6 +44,8 @@ LIKELY = 0.5
 """Probability that an effect of the list is missing from which the most probable one is tried."""
 NETWORK = "network"
 """Name of the step that re-tunes the network."""
+INTERRUPTED = "interrupted"
+"""Kind of the verdict of the last round where Ctrl-C ended the loop."""
 
 
 FORMER_KEYS = {"rivals": "competing", "error_open_mm": "error_training_mm"}
@@ -80,6 +82,16 @@ Progress = Callable[[Round], None]
 """Called after each round."""
 
 
+@dataclass(frozen=True)
+class _Made:
+    """A model of the loop, with what belongs to it."""
+
+    model: ArmModel
+    known: TrainingResiduals | None
+    """Residuals on the rows of its fit; None where the network was re-tuned since."""
+    parameters: tuple[Parameter, ...] = ()
+
+
 @dataclass(frozen=True, eq=False)
 class Improvement:
     """A model with every effect that was significant and lowered the error."""
@@ -111,6 +123,11 @@ class Improvement:
     model_error: Fall | None = None
     """The error of the model itself on the held-out rows, where the others are paired
     differences."""
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether Ctrl-C ended the loop: the rounds are those that were finished before."""
+        return self.rounds[-1].verdict == INTERRUPTED
 
     @property
     def steps(self) -> list[tuple[str, float]]:
@@ -158,6 +175,7 @@ class Improvement:
         return {
             "sentence": self.sentence,
             "claimed": self.claimed,
+            "interrupted": self.interrupted,
             "effects": [name for name, _ in self.steps if name != NETWORK],
             "network_retuned": any(name == NETWORK for name, _ in self.steps),
             "error_mm": self.held_out.to_json(),
@@ -190,7 +208,9 @@ def improve(
 
     Each round is `diagnose` on the first three quarters of each recording, and the fit of the
     effect that it names; `Improvement` has the rounds, the model, and its error on the last
-    quarter, mm. The given model stays as it is. Raises InputError as `amend` does.
+    quarter, mm. The given model stays as it is. Raises InputError as `amend` does. Ctrl-C raises
+    `Interrupted` (`surgisoft.errors`) with the rounds that are finished, or KeyboardInterrupt where
+    none has added anything.
 
     Model and recordings may be given by their paths; a callable, or its name, is a model too, with
     error_mm as its validated error, mm (docs/your_model.md).
@@ -227,8 +247,7 @@ def improve(
         notes, problem = (*notes, *both.notes), both.table.training()
         asked = both.training()
     is_paired = both is not None and both.used
-    models, rounds = [model], []
-    parameters: tuple[Parameter, ...] = ()
+    made, rounds = [_Made(model, known)], []
     diagnoses: list[Diagnosis] = []
     added: list[str] = []
 
@@ -236,108 +255,122 @@ def improve(
         rounds.append(done)
         tell(done)
 
-    def diagnosis_of(current: ArmModel) -> Diagnosis:
+    def diagnosis_of(current: _Made) -> Diagnosis:
         if both is not None:
-            wrong = None if added else find_setup_faults(current, recordings)
+            wrong = None if added else find_setup_faults(current.model, recordings)
             if wrong is not None:
                 return with_setup(wrong)
-            return diagnose_change(asked.with_model(current), both, lambda text: None)
+            return diagnose_change(asked.with_model(current.model), both, lambda text: None)
         return diagnose(
-            current,
+            current.model,
             recordings,
-            reference=known if reference is None else reference,
+            reference=current.known if reference is None else reference,
             refit=refit,
             refit_progress=refit_progress,
             processes=processes,
             setup_tests=not added,
         )
 
-    going, trained = True, False  # whether the network was trained on these rows
-    while going and len(added) < most_effects:
-        found = diagnosis_of(models[-1])
-        diagnoses.append(found)
-        error = fall_of(problem, problem.with_model(models[-1])).after
-        current = Round(found.verdict.kind, found.verdict.sentence, None, (), None, error)
-        names = [name for name in next_effects(found) if name not in added]
-        going = False
-        for name in names[: most_effects - len(added)]:
-            posed = problem.with_model(models[-1])
-            fitted: Fitted | JointFit
-            together = found.refit is not None and found.refit.winner == name
-            if found.refit is not None and together and refit == "auto" and not trained:
-                plain_mm = apart_mm(posed, [*added, name])
-                together = plain_mm is None or plain_mm > found.refit.of(name).heldout_rmse_mm
-            if found.refit is not None and together:
-                validated = found.refit.of(name)
-                fitted = fit_together(posed, [*added, name], validated, progress=refit_progress)
-            else:
-                fitted = fit_effects(posed, [*added, name])
-            fall = fall_of(posed, problem.with_model(fitted.model))
-            doubt = _doubt(name, fall, fitted.parameters)
-            if not doubt and isinstance(fitted, JointFit):
-                alone, together_ = (
-                    problem.with_model(each) for each in (fitted.alone, fitted.model)
-                )
-                doubt = _idle(name, fall_of(alone, together_))
-            if doubt and fall.significant and isinstance(fitted, Fitted):
-                tried = fit_plausible(posed, fitted, [*added, name], name)
-                if tried is not None:
-                    less = fall_of(posed, problem.with_model(tried.model))
-                    if _as_good(less, fall) and not _doubt(name, less, tried.parameters):
-                        fitted, fall, doubt = tried, less, ""
-            if doubt:
-                current = replace(current, sentence=f"{current.sentence}; but {doubt}")
-                continue
-            going = True
-            added.append(name)
-            models.append(fitted.model)
-            parameters = fitted.parameters
-            if isinstance(fitted, JointFit):
-                trained = True
-                known = fitted.model.training_residuals
-                discrepancy = model_discrepancy(fitted.model, problem.noise_mm)
-                problem = replace(problem, discrepancy_mm=discrepancy)
-            note(replace(_step(current, name, found, fall.after), together=together))
-            current = replace(current, sentence=f"named beside {name} by the same diagnosis")
-        if not going:
-            note(current)
-    tuned = retune(models[-1], problem) if added and both is None else None
-    if tuned is not None and tuned.kept:
-        after = fall_of(problem, problem.with_model(tuned.model)).after
-        why = (
-            "a re-tuned network lowers the squared error on held-out motion by "
-            f"{100 * tuned.gain:.0f} %"
-        )
-        models.append(tuned.model)
-        note(Round("surrogate_undertrained", why, NETWORK, (), None, after))
-    if models[-1] is not model:
+    def add_effects() -> None:
+        nonlocal problem
+        going, trained = True, False  # whether the network was trained on these rows
+        while going and len(added) < most_effects:
+            found = diagnosis_of(made[-1])
+            diagnoses.append(found)
+            error = fall_of(problem, problem.with_model(made[-1].model)).after
+            current = Round(found.verdict.kind, found.verdict.sentence, None, (), None, error)
+            names = [name for name in next_effects(found) if name not in added]
+            going = False
+            for name in names[: most_effects - len(added)]:
+                posed = problem.with_model(made[-1].model)
+                fitted: Fitted | JointFit
+                together = found.refit is not None and found.refit.winner == name
+                if found.refit is not None and together and refit == "auto" and not trained:
+                    plain_mm = apart_mm(posed, [*added, name])
+                    together = plain_mm is None or plain_mm > found.refit.of(name).heldout_rmse_mm
+                if found.refit is not None and together:
+                    validated = found.refit.of(name)
+                    fitted = fit_together(posed, [*added, name], validated, progress=refit_progress)
+                else:
+                    fitted = fit_effects(posed, [*added, name])
+                fall = fall_of(posed, problem.with_model(fitted.model))
+                doubt = _doubt(name, fall, fitted.parameters)
+                if not doubt and isinstance(fitted, JointFit):
+                    alone, together_ = (
+                        problem.with_model(each) for each in (fitted.alone, fitted.model)
+                    )
+                    doubt = _idle(name, fall_of(alone, together_))
+                if doubt and fall.significant and isinstance(fitted, Fitted):
+                    tried = fit_plausible(posed, fitted, [*added, name], name)
+                    if tried is not None:
+                        less = fall_of(posed, problem.with_model(tried.model))
+                        if _as_good(less, fall) and not _doubt(name, less, tried.parameters):
+                            fitted, fall, doubt = tried, less, ""
+                if doubt:
+                    current = replace(current, sentence=f"{current.sentence}; but {doubt}")
+                    continue
+                going = True
+                added.append(name)
+                known = made[-1].known
+                if isinstance(fitted, JointFit):
+                    trained = True
+                    known = fitted.model.training_residuals
+                    discrepancy = model_discrepancy(fitted.model, problem.noise_mm)
+                    problem = replace(problem, discrepancy_mm=discrepancy)
+                made.append(_Made(fitted.model, known, fitted.parameters))
+                note(replace(_step(current, name, found, fall.after), together=together))
+                current = replace(current, sentence=f"named beside {name} by the same diagnosis")
+            if not going:
+                note(current)
+        tuned = retune(made[-1].model, problem) if added and both is None else None
+        if tuned is not None and tuned.kept:
+            after = fall_of(problem, problem.with_model(tuned.model)).after
+            why = (
+                "a re-tuned network lowers the squared error on held-out motion by "
+                f"{100 * tuned.gain:.0f} %"
+            )
+            made.append(_Made(tuned.model, None, made[-1].parameters))
+            note(Round("surrogate_undertrained", why, NETWORK, (), None, after))
+
+    try:
+        add_effects()
+    except KeyboardInterrupt:
+        steps = [done for done in rounds if done.step is not None]
+        if not steps:
+            raise
+        del made[len(steps) + 1 :]
+        rounds.append(_interrupted(steps))
+    final_model = made[-1].model
+    if final_model is not model:
         # The residuals of the fit say nothing of a network that was re-tuned since.
-        retuned = tuned is not None and tuned.kept
-        models[-1].training_residuals = None if retuned else known
-        models[-1].fitted_rows = FittedRows.of([table.history]).joined(model.fitted_rows)
+        final_model.training_residuals = made[-1].known
+        final_model.fitted_rows = FittedRows.of([table.history]).joined(model.fitted_rows)
     opened = sealed.opened(table)
     held_out = whole = opened.final_check()
     if is_paired:
         held_out = before_and_after(opened, earlier, "always").table.final_check()
-    after_round = iter([held_out.with_model(one) for one in models[1:]])
+    after_round = iter([held_out.with_model(each.model) for each in made[1:]])
     final, shown = held_out, []
     for done in rounds:
         final = next(after_round) if done.step is not None else final
         shown.append(replace(done, error_mm=fall_of(held_out, final).after))
-    return Improvement(
-        model=models[-1],
+    result = Improvement(
+        model=final_model,
         rounds=tuple(shown),
-        parameters=parameters,
+        parameters=made[-1].parameters,
         held_out=fall_of(held_out, final),
-        tracks=(track_of(problem, problem.with_model(models[-1])), track_of(held_out, final)),
+        tracks=(track_of(problem, problem.with_model(final_model)), track_of(held_out, final)),
         seconds=time.perf_counter() - begin,
         notes=notes,
         diagnoses=tuple(diagnoses),
         amended_from=given,
         recordings=tuple(each.name for each in recordings),
         change=None if both is None else both.change,
-        model_error=fall_of(whole, whole.with_model(models[-1])) if is_paired else None,
+        model_error=fall_of(whole, whole.with_model(final_model)) if is_paired else None,
     )
+    if result.interrupted:
+        raise Interrupted(result)
+    return result
 
 
 def next_effects(found: Diagnosis) -> tuple[str, ...]:
@@ -383,6 +416,13 @@ def _idle(name: str, fall: Fall) -> str:
     if fall.significant:
         return ""
     return f"the network alone, trained for as many epochs as with {name}, lowers the error as far"
+
+
+def _interrupted(steps: list[Round]) -> Round:
+    """The last round of a loop that Ctrl-C ended after some steps."""
+    names = " and ".join(str(done.step) for done in steps)
+    why = f"Ctrl-C ended the loop after {names}; whether an effect is still missing was not decided"
+    return Round(INTERRUPTED, why, None, (), None, steps[-1].error_training_mm)
 
 
 def _step(current: Round, name: str, found: Diagnosis, error_mm: float) -> Round:

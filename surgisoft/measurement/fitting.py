@@ -32,7 +32,9 @@ def fit(
 
     The model (Chen et al. 2025) maps actuation (T, m), in the recordings' unit, to key points
     (T, n, 3) mm in the arm base frame. Raises InputError where the recordings are of different
-    arms, too short, or hold numbers that are not finite.
+    arms, too short, or hold numbers that are not finite. Ctrl-C raises `Interrupted`
+    (`surgisoft.errors`), whose `result` has the best model so far, or KeyboardInterrupt before the
+    first validation.
 
     Returns the model with the account of its fit; `save_model(result.model, folder,
     result.report())` writes both.

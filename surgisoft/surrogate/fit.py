@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from scipy.special import stdtrit
 from torch import Tensor
 
-from surgisoft.errors import InputError, unknown_name
+from surgisoft.errors import InputError, Interrupted, unknown_name
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.chain import Taps
 from surgisoft.surrogate.effects import hypothesis_of, known_effects, make_effect
@@ -30,7 +30,14 @@ from surgisoft.surrogate.history import History
 from surgisoft.surrogate.interval import ErrorInterval, calibrate, coverage_of, distance_to
 from surgisoft.surrogate.kernel_fit import KernelFit, fit_kernel
 from surgisoft.surrogate.model import ArmModel
-from surgisoft.surrogate.networks import HIDDEN, ConstantCurvature, HawEnsemble, HawNN, KernelArm
+from surgisoft.surrogate.networks import (
+    HIDDEN,
+    ConstantCurvature,
+    HawEnsemble,
+    HawNN,
+    KernelArm,
+    RecurrentArm,
+)
 from surgisoft.surrogate.prior_mean import arcs_of, fit_prior_mean
 from surgisoft.surrogate.scan import direction_scan
 from surgisoft.surrogate.training import (
@@ -247,7 +254,7 @@ class StageReport:
     kept: bool
     """Whether the stage was accepted."""
     reason: str = ""
-    """Why the stage was rejected; empty if it was accepted."""
+    """Why the stage was rejected, or `interrupted`; empty if it was accepted."""
     simpler_rmse_mm: float | None = None
     """Held-out RMSE of the simpler model trained just as long, mm."""
     settings: str = ""
@@ -255,6 +262,29 @@ class StageReport:
     tried_mm: dict[str, float] = field(default_factory=dict)
     """Held-out RMSE of each effect with which `auto` compared the stage's, after a short training,
     mm; `none`: without any."""
+
+
+@dataclass(frozen=True)
+class Interruption:
+    """Where Ctrl-C ended a fit."""
+
+    stage: str
+    """Name of the training that was interrupted; `validation` where all stages were finished."""
+    epoch: int
+    """Epoch of that training after which it was validated last; 0: not yet."""
+    used: bool
+    """Whether the model is the best one of that training; else it is that of `finished`."""
+    finished: tuple[str, ...]
+    """Stages that were finished and accepted before."""
+
+    @property
+    def sentence(self) -> str:
+        """The interruption in words."""
+        after = f", validated last after epoch {self.epoch}" if self.epoch else ""
+        model = "the best one so far"
+        if not self.used:
+            model = f"that of the finished stages: {', '.join(self.finished)}"
+        return f"the fit was interrupted in '{self.stage}'{after}; the model is {model}"
 
 
 @dataclass
@@ -278,6 +308,10 @@ class FitResult:
     calibrated the interval themselves, or without one."""
     known: TrainingResiduals | None = None
     """Residuals on the rows that the model was fitted to and validated on."""
+    interrupted: Interruption | None = None
+    """Where Ctrl-C ended the fit; None for a complete one."""
+    running: tuple[str, int] = ("", 0)
+    """Name of the training that began last, and the number of losses before it."""
 
     def report(self) -> dict:
         """Record of the fit, for a JSON file beside the model."""
@@ -287,6 +321,7 @@ class FitResult:
             "warnings": self.warnings,
             "seconds": self.seconds,
             "coverage_held_out": self.covered,
+            "interrupted": self.interrupted and asdict(self.interrupted),
             "loss": [
                 dict(zip(("stage", "epoch", "training_mm2", "held_out_mm2"), row, strict=True))
                 for row in self.loss
@@ -341,7 +376,8 @@ def fit(
 
     progress: called as `Progress` describes. Raises InputError where the recordings cannot be
     fitted (too few rows, missing key points, values out of range) or the configuration names
-    something unknown.
+    something unknown. Ctrl-C raises `Interrupted` with the best model so far, or KeyboardInterrupt
+    before the first validation.
     """
     _check(train, valid, spec, config)
     start = time.perf_counter()
@@ -352,30 +388,90 @@ def fit(
     nothing: Any = None
     result = FitResult(nothing, [], excitation(train, low, high, band), [], 0.0)
     result.warnings.extend(_still_chambers(train, spec))
-    if config.network == "recurrent":
-        _fit_recurrent(data, spec, config, result, progress)
-    elif config.network == "kernel":
-        _fit_kernel(data, spec, config, result, progress)
+    try:
+        if config.network == "recurrent":
+            _fit_recurrent(data, spec, config, result, progress)
+        elif config.network == "kernel":
+            _fit_kernel(data, spec, config, result, progress)
+        else:
+            validated = excitation(data.validation, low, high, band)
+            support = _Support(result.excitation, all(each.minor_loops for each in validated))
+            _fit_stages(data, spec, config, support, result, progress)
+    except KeyboardInterrupt:
+        if result.model is None:
+            raise
+        _take_interrupted(data, result, time.perf_counter() - start)
+    try:
+        _finish(data, result)
+    except KeyboardInterrupt:
+        if result.interrupted is not None:  # the second Ctrl-C
+            raise
+        names = tuple(stage.name for stage in result.stages if stage.kept)
+        result.interrupted = Interruption("validation", 0, False, names)
+        _finish(data, result)
+    result.seconds = time.perf_counter() - start
+    if result.interrupted is not None:
+        raise Interrupted(result)
+    return result
+
+
+def _fit_stages(data: Data, spec, config, support, result: FitResult, progress) -> None:
+    """Forward selection of a network's stages; the result has the model and its validation."""
+    names = _stages(config)
+    grown = [name for name in names if _supported(result, name, config, support)]
+    for name in grown:
+        if name == AUTO:
+            _add_memory(data, spec, config, support, result, progress)
+            continue
+        candidate = _grow(result.model, name, spec, config, support, data)
+        epochs = _stage_epochs(name, grown, config)
+        _stage(candidate, name, epochs, config, data, result, progress)
+    interval = None
+    if config.members > 1:
+        interval = _ensemble(data, config, result, progress)
+    rows = data.validation_rows(result.model)
+    validation = validated_error(rows.target, model_rows(result.model, rows))
+    result.model.validation = replace(validation, interval=interval)
+    if config.network == AUTO:
+        _compare_kernel(data, spec, config, result, progress)
+
+
+def _begin(result: FitResult, name: str) -> None:
+    """Note the training that begins, for an interruption."""
+    result.running = name, len(result.loss)
+
+
+def _validated_epoch(result: FitResult) -> int:
+    """Epoch after which the running training was validated last; 0: not yet."""
+    name, before = result.running
+    losses = result.loss[before:]
+    return losses[-1][1] if losses and name != "kernel" else 0  # the kernel's are trials
+
+
+def _take_interrupted(data: Data, result: FitResult, seconds: float) -> None:
+    """Validate the model of an interrupted fit, and note where it was interrupted."""
+    model, stage = result.model, result.running[0]
+    finished = tuple(each.name for each in result.stages if each.kept)
+    used, epoch = not finished, _validated_epoch(result)
+    result.interrupted = Interruption(stage, epoch, used, finished)
+    if isinstance(model.network, KernelArm):  # validated by its own cross-validation
+        return
+    model.rest_mm.copy_(rest_shape(data.train))
+    if isinstance(model.network, RecurrentArm):
+        predicted, measured = held_rows(model, data)
     else:
-        validated = excitation(data.validation, low, high, band)
-        support = _Support(result.excitation, all(chamber.minor_loops for chamber in validated))
-        names = _stages(config)
-        grown = [name for name in names if _supported(result, name, config, support)]
-        for name in grown:
-            if name == AUTO:
-                _add_memory(data, spec, config, support, result, progress)
-                continue
-            candidate = _grow(result.model, name, spec, config, support, data)
-            epochs = _stage_epochs(name, grown, config)
-            _stage(candidate, name, epochs, config, data, result, progress)
-        interval = None
-        if config.members > 1:
-            interval = _ensemble(data, config, result, progress)
-        rows = data.validation_rows(result.model)
-        validation = validated_error(rows.target, model_rows(result.model, rows))
-        result.model.validation = replace(validation, interval=interval)
-        if config.network == AUTO:
-            _compare_kernel(data, spec, config, result, progress)
+        rows = data.validation_rows(model)
+        predicted, measured = model_rows(model, rows), rows.target
+    error = validated_error(measured, predicted)
+    model.validation = replace(error, interval=model.validation.interval)
+    if used and error.rmse_mm is not None:
+        report = StageReport(stage, error.rmse_mm, epoch, seconds, True, "interrupted")
+        result.stages.append(report)
+
+
+def _finish(data: Data, result: FitResult) -> None:
+    """State a model's interval, noise and residuals, from its validation error on."""
+    train, valid = data.train, data.valid
     _state_interval(data, result)
     validation = replace(result.model.validation, noise_mm=data.validation.noise_mm)
     result.model.validation = validation
@@ -388,8 +484,6 @@ def fit(
     result.known = result.model.residuals_on([train] if valid is None else [train, valid])
     result.model.training_residuals = result.known
     result.model.fitted_rows = FittedRows.of([train] if valid is None else [train, valid])
-    result.seconds = time.perf_counter() - start
-    return result
 
 
 def _still_chambers(train: History, spec: ArmSpec) -> list[str]:
@@ -408,9 +502,14 @@ def _fit_recurrent(data: Data, spec, config, result: FitResult, progress) -> Non
     model = new_recurrent(spec)
     normalise(model.network, data.train)
     model.rest_mm.copy_(rest_shape(data.train))
-    result.loss, epochs = train_recurrent(
-        model, data, config.epochs, config.learning_rate, config.seed, progress
-    )
+    _begin(result, "recurrent")
+    rate, seed = config.learning_rate, config.seed
+    try:
+        epochs = train_recurrent(model, data, config.epochs, rate, seed, result.loss, progress)
+    except KeyboardInterrupt:
+        if _validated_epoch(result):
+            result.model = model
+        raise
     predicted, measured = held_rows(model, data)
     model.validation = validated_error(measured, predicted)
     result.model = model
@@ -564,11 +663,18 @@ def _stage(
     come from the addition and not from the training.
     """
     begin = time.perf_counter()
-    done = train_model(candidate, data, name, epochs, config, result.loss, progress)
+    _begin(result, name)
+    try:
+        done = train_model(candidate, data, name, epochs, config, result.loss, progress)
+    except KeyboardInterrupt:
+        if result.model is None and _validated_epoch(result):
+            result.model = candidate
+        raise
     after = _square(candidate, data)
     kept, reason, simpler_rmse = True, "", None
     if result.model is not None:
         simpler = copy.deepcopy(result.model)
+        _begin(result, f"without {name}")
         train_model(simpler, data, f"without {name}", epochs, config, result.loss, progress)
         before = _square(simpler, data)
         simpler_rmse = _rmse(before)
@@ -614,6 +720,7 @@ def _add_memory(data: Data, spec, config, support: _Support, result: FitResult, 
             if name != "none":
                 candidate = _grow(result.model, name, spec, config, support, data)
             label = name if name != "none" else "without effects"
+            _begin(result, label)
             train_model(candidate, data, label, epochs, config, result.loss, progress)
             tried[name] = _rmse(_square(candidate, data))
         best = min(names, key=lambda name: tried[name])
@@ -649,6 +756,7 @@ def _fit_kernel(data: Data, spec, config, result: FitResult, progress) -> None:
 
 def _kernel(data: Data, spec, config, result: FitResult, progress) -> KernelFit:
     """Kernel regression with memory; adds its losses to the result."""
+    _begin(result, "kernel")
 
     def report(trial: int, trials: int, loss: float) -> None:
         result.loss.append(("kernel", trial, loss, loss))
@@ -663,9 +771,9 @@ def _take_kernel(found: KernelFit, data: Data, result: FitResult) -> None:
     measured, predicted = found.measured_mm, found.predicted_mm
     if data.valid is not None:
         measured, predicted = _on_validation(found.model, data.valid)
-    result.model = found.model
     error = validated_error(measured, predicted)
-    result.model.validation = replace(error, interval=found.interval)
+    found.model.validation = replace(error, interval=found.interval)
+    result.model = found.model
 
 
 @torch.no_grad()
@@ -712,6 +820,7 @@ def _ensemble(data: Data, config, result: FitResult, progress) -> ErrorInterval 
     begin = time.perf_counter()
     epochs = max(CHECK_EVERY, round(MEMBER_SHARE * config.epochs))
     before = _rmse(_square(result.model, data))
+    _begin(result, "ensemble")
     model, interval = train_ensemble(
         result.model, data, config.members, epochs, config, result.loss, progress
     )

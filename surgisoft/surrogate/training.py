@@ -227,7 +227,8 @@ def train(
 
     The best average is that of least validation error (early stopping). Memory parameters are
     trained in the stages of effects only. Appends (name, epoch, training loss, validation loss) to
-    `losses`; returns the number of epochs done.
+    `losses`; returns the number of epochs done. After Ctrl-C, which is raised again, the model has
+    the best average of the validations so far.
     """
     every = [p for effect in model.effects.values() for p in effect.memory_parameters()]
     every += [p for _, effect in model.stage("line") for p in effect.amplitudes().values()]
@@ -255,29 +256,31 @@ def train(
 
     best, best_state, waited, loss = validation_loss(), copy.deepcopy(model.state_dict()), 0, 0.0
     epoch = 0
-    for epoch in range(1, epochs + 1):
-        order = torch.randperm(len(rows.target), generator=generator)
-        for part in order[: steps * batch].split(batch):
-            loss = _step(model, rows.take(part), weights, optimiser)
-            schedule.step()
-            with torch.no_grad():
-                share = max(1 / (AVERAGE_EPOCHS * steps), 1 / (schedule.last_epoch + 1))
-                torch._foreach_lerp_(slow, fast, share)
-        if through is not None and epoch > MEMORY_FIRST:
-            through.steps(trace)
-            trace = _trace(model, data)
-            rows = data.fitted_rows(model, trace)
-        if epoch % CHECK_EVERY == 0 or epoch == epochs:
-            now = validation_loss()
-            losses.append((name, epoch, loss, now))
-            waited = 0 if now < best else waited + 1
-            if now < best:
-                best, best_state = now, copy.deepcopy(average.state_dict())
-            if progress is not None:
-                progress(name, epoch, epochs, best)
-            if waited >= PATIENCE:
-                break
-    model.load_state_dict(best_state)
+    try:
+        for epoch in range(1, epochs + 1):
+            order = torch.randperm(len(rows.target), generator=generator)
+            for part in order[: steps * batch].split(batch):
+                loss = _step(model, rows.take(part), weights, optimiser)
+                schedule.step()
+                with torch.no_grad():
+                    share = max(1 / (AVERAGE_EPOCHS * steps), 1 / (schedule.last_epoch + 1))
+                    torch._foreach_lerp_(slow, fast, share)
+            if through is not None and epoch > MEMORY_FIRST:
+                through.steps(trace)
+                trace = _trace(model, data)
+                rows = data.fitted_rows(model, trace)
+            if epoch % CHECK_EVERY == 0 or epoch == epochs:
+                now = validation_loss()
+                waited = 0 if now < best else waited + 1
+                if now < best:
+                    best, best_state = now, copy.deepcopy(average.state_dict())
+                losses.append((name, epoch, loss, now))
+                if progress is not None:
+                    progress(name, epoch, epochs, best)
+                if waited >= PATIENCE:
+                    break
+    finally:
+        model.load_state_dict(best_state)
     return epoch
 
 
@@ -451,11 +454,12 @@ BURN_IN = 32
 
 
 def train_recurrent(
-    model: ArmModel, data: Data, epochs: int, rate: float, seed: int, progress=None
-) -> tuple[list[tuple[str, int, float, float]], int]:
+    model: ArmModel, data: Data, epochs: int, rate: float, seed: int, losses: list, progress=None
+) -> int:
     """Train a recurrent model by Adam on windows; it ends with its best validated weights.
 
-    Returns (losses, number of epochs done).
+    Appends ("recurrent", epoch, training loss, validation loss) to `losses`; returns the number of
+    epochs done. After Ctrl-C, which is raised again, the model has the best weights so far.
     """
     train = data.train
     generator = torch.Generator().manual_seed(seed)
@@ -480,35 +484,37 @@ def train_recurrent(
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
         optimiser, epochs * max(1, len(starts) // batch)
     )
-    losses, best, waited, epoch = [], float("inf"), 0, 0
+    best, waited, epoch = float("inf"), 0, 0
     best_state = copy.deepcopy(model.state_dict())
     along = torch.arange(window)
-    for epoch in range(1, epochs + 1):
-        for part in torch.randperm(len(starts), generator=generator).split(batch):
-            rows, columns = starts[part, :1], starts[part, 1:] + along
-            pressure, direction = trace.pressure[rows, columns], trace.direction[rows, columns]
-            points = network(pressure, direction, network.scan(pressure, direction))
-            # The first window of a run starts where the run starts, so nothing has to form.
-            counts = (along >= burn) | (starts[part, 1:] == 0)
-            wanted = torch.where(counts[..., None, None], target[rows, columns], torch.nan)
-            loss = weighted_mse(points.flatten(0, 1), wanted.flatten(0, 1), weights)
-            optimiser.zero_grad(set_to_none=True)
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-            optimiser.step()
-            schedule.step()
-        if epoch % CHECK_EVERY == 0 or epoch == epochs:
-            now = held_error(model, data, weights)
-            losses.append(("recurrent", epoch, float(loss.detach()), now))
-            waited = 0 if now < best else waited + 1
-            if now < best:
-                best, best_state = now, copy.deepcopy(model.state_dict())
-            if progress is not None:
-                progress("recurrent", epoch, epochs, best)
-            if waited >= PATIENCE:
-                break
-    model.load_state_dict(best_state)
-    return losses, epoch
+    try:
+        for epoch in range(1, epochs + 1):
+            for part in torch.randperm(len(starts), generator=generator).split(batch):
+                rows, columns = starts[part, :1], starts[part, 1:] + along
+                pressure, direction = trace.pressure[rows, columns], trace.direction[rows, columns]
+                points = network(pressure, direction, network.scan(pressure, direction))
+                # The first window of a run starts where the run starts, so nothing has to form.
+                counts = (along >= burn) | (starts[part, 1:] == 0)
+                wanted = torch.where(counts[..., None, None], target[rows, columns], torch.nan)
+                loss = weighted_mse(points.flatten(0, 1), wanted.flatten(0, 1), weights)
+                optimiser.zero_grad(set_to_none=True)
+                loss.backward()
+                torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+                optimiser.step()
+                schedule.step()
+            if epoch % CHECK_EVERY == 0 or epoch == epochs:
+                now = held_error(model, data, weights)
+                waited = 0 if now < best else waited + 1
+                if now < best:
+                    best, best_state = now, copy.deepcopy(model.state_dict())
+                losses.append(("recurrent", epoch, float(loss.detach()), now))
+                if progress is not None:
+                    progress("recurrent", epoch, epochs, best)
+                if waited >= PATIENCE:
+                    break
+    finally:
+        model.load_state_dict(best_state)
+    return epoch
 
 
 def held_rows(model: ArmModel, data: Data) -> tuple[Tensor, Tensor]:

@@ -1,13 +1,20 @@
-"""Ctrl-C leaves a complete output or none, says which, and gives exit code 130."""
+"""Ctrl-C leaves what is finished, says what that is, and gives exit code 130."""
 
+import json
 import os
+import re
+import signal
+import subprocess
+import sys
 
 import pytest
+import torch
 import trimesh
 
 import surgisoft.cli.progress
 from surgisoft.cli import run
 from surgisoft.files import noted_writes, write_atomically
+from surgisoft.surrogate.checkpoint import load_model
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +34,7 @@ def bench(tmp_path_factory):
 
 
 COMMANDS = {
-    "fit": "fit rec.csv --epochs 10 --widths 8 -o NEW",
+    "fit --network kernel": "fit rec.csv --network kernel -o NEW",
     "compare": "compare default rec.csv --json j.json --report NEW --replay r.rrd",
     "diagnose": "diagnose default rec.csv --json j.json --report NEW",
     "amend": "amend default --effect creep --data rec.csv -o NEW --anyway --report page",
@@ -42,6 +49,36 @@ COMMANDS = {
 
 def interrupt(*_):
     raise KeyboardInterrupt
+
+
+CHILD = (
+    "import surgisoft.cli.progress as progress; progress.LINE_EVERY_S = 0.0; "
+    "from surgisoft.cli import main; main()"
+)
+"""A command that reports every progress on standard error."""
+
+
+def interrupted(command, pattern, folder):
+    """Run a command in a process and send it a SIGINT when its progress matches a pattern.
+
+    Returns its standard output and error; the exit code has to be 130.
+    """
+    child = subprocess.Popen(
+        [sys.executable, "-c", CHILD, *command.split()],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    seen = []
+    for line in child.stderr:
+        seen.append(line)
+        if re.search(pattern, line):
+            child.send_signal(signal.SIGINT)
+            break
+    out, error = child.communicate()
+    assert child.returncode == 130, "".join(seen) + error
+    return out, error
 
 
 def names(folder):
@@ -59,10 +96,98 @@ def test_ctrl_c_during_the_work_leaves_nothing(command, bench, monkeypatch, caps
     assert names(bench) == before
 
 
+def test_ctrl_c_before_the_first_validation_of_a_fit_leaves_nothing(bench, monkeypatch, capsys):
+    monkeypatch.chdir(bench)
+    before = names(bench)
+    monkeypatch.setattr(torch.optim.Adam, "step", interrupt)
+    assert run(["fit", "rec.csv", "--epochs", "10", "--widths", "8", "-o", "NEW"]) == 130
+    said = capsys.readouterr().err.splitlines()
+    assert said[-1] == "surgisoft: interrupted; no output was written"
+    assert names(bench) == before
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no SIGINT to one process")
+@pytest.mark.parametrize("network", ["haw_nn", "recurrent"])
+def test_ctrl_c_in_the_first_stage_of_a_fit_keeps_its_best_model(network, bench, tmp_path):
+    command = f"fit {bench / 'rec.csv'} --network {network} --epochs 100000 --widths 8 -o NEW"
+    out, error = interrupted(command, "fit: .*held-out", tmp_path)
+    report = json.loads((tmp_path / "NEW" / "report.json").read_text())
+    where = report["interrupted"]
+    stage = {"haw_nn": "pressure"}.get(network, network)
+    assert where == {"stage": stage, "epoch": where["epoch"], "used": True, "finished": []}
+    losses = [row["held_out_mm2"] for row in report["loss"]]
+    assert [row["epoch"] for row in report["loss"]][-1] == where["epoch"] >= 10
+    model = load_model(tmp_path / "NEW")
+    assert report["stages"][0]["valid_rmse_mm"] == model.validation.rmse_mm
+    assert model.validation.rmse_mm < 15.0  # the recording's tip moves by far more
+    assert model.fitted_rows is not None
+    assert len(losses) == where["epoch"] // 10
+    assert f"the fit was interrupted in '{stage}', validated last after epoch" in error
+    assert error.splitlines()[-1].endswith("written before and complete: NEW; nothing else")
+    assert "next," not in out
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no SIGINT to one process")
+def test_ctrl_c_in_a_later_stage_of_a_fit_keeps_the_finished_stages(bench, tmp_path):
+    command = f"fit {bench / 'rec.csv'} --effects hysteresis --epochs 400 --widths 8 -o NEW"
+    _, error = interrupted(command, "hysteresis: held-out", tmp_path)
+    report = json.loads((tmp_path / "NEW" / "report.json").read_text())
+    assert report["interrupted"]["stage"] == "hysteresis"
+    assert report["interrupted"]["finished"] == ["pressure"]
+    assert not report["interrupted"]["used"]
+    assert [stage["name"] for stage in report["stages"]] == ["pressure"]
+    model = load_model(tmp_path / "NEW")
+    assert not model.effects
+    assert model.validation.rmse_mm == pytest.approx(report["stages"][0]["valid_rmse_mm"])
+    assert "the model is that of the finished stages: pressure" in error
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no SIGINT to one process")
+def test_ctrl_c_in_improve_keeps_the_finished_rounds(tmp_path):
+    assert run(f"collect mixed --hidden creep payload -o {tmp_path / 'rec.parquet'}".split()) == 0
+    command = "improve default rec.parquet -o NEW --json j.json --report page"
+    out, error = interrupted(command, "improve: .*creep", tmp_path)
+    found = json.loads((tmp_path / "j.json").read_text())
+    assert found["interrupted"]
+    assert found["effects"] == ["creep"]
+    assert [done["step"] for done in found["rounds"]] == ["creep", None]
+    assert found["rounds"][-1]["verdict"] == "interrupted"
+    assert (
+        found["rounds"][0]["error_mm"] == found["error_mm"]["after"] < found["error_mm"]["before"]
+    )
+    assert list(load_model(tmp_path / "NEW").effects) == ["hysteresis", "creep"]
+    assert json.loads((tmp_path / "NEW" / "report.json").read_text()) == found
+    assert "whether an effect is still missing was not decided" in (
+        tmp_path / "page" / "report.html"
+    ).read_text(encoding="utf-8")
+    assert "surgisoft improve NEW rec.parquet -o OTHER" in out
+    assert "NEW, j.json, page" in error.splitlines()[-1]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no SIGINT to one process")
+def test_ctrl_c_in_evaluate_keeps_the_finished_policies(tmp_path):
+    """The same numbers as without an interruption, and none of the policy that was interrupted."""
+    task = "evaluate scripted random --task track_circle --episodes 3"
+    command = f"{task} --json j.json --report page --replay r.rrd"
+    out, error = interrupted(command, "evaluate: .*random", tmp_path)
+    found = json.loads((tmp_path / "j.json").read_text())
+    assert found["interrupted"]
+    assert list(found["policies"]) == ["scripted"]
+    assert run([*task.replace(" random", "").split(), "--json", str(tmp_path / "whole.json")]) == 0
+    whole = json.loads((tmp_path / "whole.json").read_text())
+    assert not whole["interrupted"]
+    assert found["policies"] == whole["policies"]
+    words = "interrupted; finished of 3 episodes each: scripted 3, random 0"
+    assert words in error
+    assert words in out
+    assert words in (tmp_path / "page" / "report.html").read_text(encoding="utf-8")
+    assert (tmp_path / "r.rrd").is_file()
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
-        COMMANDS["fit"],
+        "fit rec.csv --epochs 10 --widths 8 -o NEW",
         COMMANDS["collect"],
         "import raw.txt --map map.toml -o NEW.csv",
         "next-experiment default --between creep line_lag --minutes 5 --as-it-stands -o NEW.csv",

@@ -368,6 +368,8 @@ def what_is_left(result: Improvement) -> Section:
     """What is left after the last round, and what to record next."""
     last = result.diagnoses[-1]
     parts: list[Part] = [Text(last_word(result))]
+    if result.interrupted:  # the last diagnosis may be that of an earlier model
+        return Section("What is left", parts)
     if last.axis:
         parts.append(Text(f"The remaining error depends most on {last.axis}."))
     wrong = [each for each in result.parameters if not each.plausible]

@@ -27,6 +27,7 @@ from surgisoft.cli.options import (
     Refit,
     Replay,
     Report,
+    complete_effects,
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
@@ -41,6 +42,7 @@ def amend(
         typer.Option(
             "--effect",
             metavar="NAME|FILE.py...",
+            autocompletion=complete_effects,
             help="Effects to add. An effect that the model has already is fitted again.",
         ),
     ],

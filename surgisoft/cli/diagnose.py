@@ -27,6 +27,7 @@ from surgisoft.cli.options import (
     Recordings,
     Refit,
     Report,
+    complete_effects,
     model_options,
     with_effect_files,
 )
@@ -62,6 +63,7 @@ def diagnose(
         list[str] | None,
         typer.Option(
             metavar="EFFECT...",
+            autocompletion=complete_effects,
             help="Effects to exclude, because the setup rules them out, such as contact.",
         ),
     ] = None,

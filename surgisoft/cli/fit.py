@@ -13,6 +13,7 @@ from surgisoft.cli.options import (
     Force,
     Recordings,
     Threads,
+    complete_memories,
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
@@ -42,6 +43,7 @@ def fit(
         typer.Option(
             "--effects",
             metavar="NAME|FILE.py...",
+            autocompletion=complete_memories,
             help="Physical effects of the line or the material to add, such as hysteresis, or "
             "files of user-defined effects (docs/effects.md); auto: held-out data choose among "
             "those with memory.",

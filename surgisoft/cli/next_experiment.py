@@ -16,6 +16,7 @@ from surgisoft.cli.options import (
     JsonFile,
     ModelError,
     Predictions,
+    complete_effects,
     model_options,
     with_effect_files,
 )
@@ -44,6 +45,7 @@ def next_experiment(
         list[str] | None,
         typer.Option(
             metavar="NAME...",
+            autocompletion=complete_effects,
             help="Competing effects, separated by spaces or commas; default: those that explain "
             "the recordings best, or all known effects if there are no recordings.",
         ),

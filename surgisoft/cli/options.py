@@ -1,6 +1,7 @@
 """Arguments and options that several commands share: one name, metavar and help text for each."""
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -73,6 +74,36 @@ NewModel = Annotated[Path, Option("-o", "--output", metavar="NEW", help="Folder 
 NewRecording = Annotated[
     Path, Option("-o", "--output", metavar="REC", help="New recording, .parquet or .csv.")
 ]
+
+
+def complete_effects(incomplete: str) -> list[str]:
+    """Known effects that begin so, after the last comma, for the shell; no user's code is run."""
+    from surgisoft.surrogate.effects import EFFECTS
+    from surgisoft.surrogate.effects.user_defined import offered
+
+    return _begin_so([*EFFECTS, *offered()], incomplete)
+
+
+def complete_memories(incomplete: str) -> list[str]:
+    """Effects that a fit adds (those of the line and the material), and `auto`, as above."""
+    from surgisoft.surrogate.effects import EFFECTS
+    from surgisoft.surrogate.effects.user_defined import offered
+
+    mine = [name for name, kind in EFFECTS.items() if kind.stage in ("line", "material")]
+    return _begin_so([*mine, *offered(), "auto"], incomplete)
+
+
+def complete_hidden(incomplete: str) -> list[str]:
+    """Hidden effects of the virtual rig that begin so, for the shell."""
+    from surgisoft.rig.hidden import HIDDEN
+
+    return _begin_so(HIDDEN, incomplete)
+
+
+def _begin_so(names: Iterable[str], incomplete: str) -> list[str]:
+    """Names that begin like the part behind the last comma, with what stands before it."""
+    before, comma, begun = incomplete.rpartition(",")
+    return [f"{before}{comma}{name}" for name in sorted(set(names)) if name.startswith(begun)]
 
 
 def _register(given: list[Path] | None) -> list[Path] | None:
@@ -196,6 +227,7 @@ Hidden = Annotated[
     Option(
         "--hidden",
         metavar="NAME[:X][@S]...",
+        autocompletion=complete_hidden,
         help="Hidden effects of the rig, which the model lacks, with their amplitudes; default 1. "
         "On the virtual rig @S lets one begin S seconds after the first reset.",
     ),

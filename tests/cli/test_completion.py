@@ -8,9 +8,19 @@ import pytest
 
 
 @pytest.mark.parametrize(
-    ("words", "expected"), [("surgisoft scene n", "new"), ("surgisoft diagnose --bef", "--before")]
+    ("words", "expected"),
+    [
+        ("surgisoft scene n", ["new"]),
+        ("surgisoft diagnose --bef", ["--before"]),
+        ("surgisoft amend default --effect cr", ["creep"]),
+        ("surgisoft diagnose default rec.csv --without pay", ["payload"]),
+        ("surgisoft next-experiment default --between creep,line_l", ["creep,line_lag"]),
+        ("surgisoft fit rec.csv --effects a", ["auto"]),
+        ("surgisoft fit rec.csv --effects pay", []),  # a payload is no effect of a fit
+        ("surgisoft collect walk --hidden kn", ["knock"]),
+    ],
 )
-def test_the_shell_completes_commands_and_options(words, expected):
+def test_the_shell_completes_commands_options_and_effects(words, expected):
     asked = {
         "_SURGISOFT_COMPLETE": "complete_bash",
         "COMP_WORDS": words,
@@ -23,4 +33,4 @@ def test_the_shell_completes_commands_and_options(words, expected):
         text=True,
         check=False,
     )
-    assert done.stdout.split() == [expected]
+    assert done.stdout.split() == expected

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from surgisoft.errors import InputError, counted
 from surgisoft.surrogate.arm import ArmSpec, ArmState
-from surgisoft.surrogate.backbone import Backbone
+from surgisoft.surrogate.backbone import ArcBackbone, Backbone, require_body
 from surgisoft.surrogate.callables.network import CallableNetwork
 from surgisoft.surrogate.callables.predicted import PredictedNetwork
 from surgisoft.surrogate.chain import Chain, Taps
@@ -196,9 +196,15 @@ class ArmModel(nn.Module):
         """Whether the network has weights that can be trained together with effects."""
         return isinstance(self.network, HawNN | HawEnsemble | ConstantCurvature)
 
-    def backbone(self, samples: int = 21, degree: int = 3) -> Backbone:
-        """The B-spline through this arm's key points."""
+    def backbone(self, samples: int = 21, degree: int = 3) -> Backbone | ArcBackbone:
+        """The B-spline through this arm's key points; an arc for an arm with one key point."""
+        if self.spec.key_points == 1:
+            return ArcBackbone.of(samples).to(self.rest_mm.device)
         return Backbone.through(self.rest_mm, samples, degree).to(self.rest_mm.device)
+
+    def require_body(self, label: str) -> None:
+        """Raise InputError where the body does not follow from the key points, see `backbone`."""
+        require_body(self.spec, self.rest_mm.cpu(), label)
 
     def initial_state(self, batch: int = 1, pressure: Tensor | None = None) -> ArmState:
         """(B) arms without history at `pressure` (B, m) in the arm's unit.

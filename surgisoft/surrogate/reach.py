@@ -20,6 +20,7 @@ def model_table(
     arm of more than six chambers.
     """
     spec = model.spec
+    model.require_body("the arm")
     if spec.chambers not in COUNTS:
         raise InputError(
             f"an arm of {spec.chambers} chambers needs too large a table; expected at "

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from surgisoft.errors import InputError
-from surgisoft.surrogate.backbone import Backbone
+from surgisoft.surrogate.arm import ArmSpec
+from surgisoft.surrogate.backbone import ArcBackbone, Backbone, require_body
 
 REST = torch.tensor([[0.0, 0.0, z] for z in (0.0, 17.5, 35.0, 52.5, 70.0)])
 
@@ -85,3 +86,67 @@ def test_at_the_key_points_it_passes_through_them_and_along_the_arc():
     expected = torch.stack([angle.sin(), 0 * angle, angle.cos()], -1).float()
     found = backbone.tangents(arc(0.5, share).float())
     torch.testing.assert_close(found, expected, atol=2e-3, rtol=0.0)
+
+
+def turned(axis: list[float], angle: float) -> torch.Tensor:
+    """(3, 3) rotation about an axis by Rodrigues' formula."""
+    x, y, z = torch.nn.functional.normalize(torch.tensor(axis, dtype=torch.float64), dim=0)
+    cross = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
+    return torch.eye(3).double() + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+
+
+@pytest.mark.parametrize("angle", [1e-5, 1e-3, 0.3, math.pi / 2, 2.5, 5.0])
+def test_the_tip_alone_gives_back_the_arc_it_is_the_end_of(angle):
+    """Arcs of a known angle, turned about the base's axis, on a base somewhere in the world."""
+    share = torch.linspace(0.0, 1.0, 13, dtype=torch.float64)
+    base = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    lines, aims = [], []
+    for row, (azimuth, length) in enumerate([(0.0, 70.0), (2.0, 35.0), (-1.1, 140.0)]):
+        base[row, :3, :3] = turned([1.0, 2.0, -0.5], 0.7 * row)
+        base[row, :3, 3] = torch.tensor([10.0, -20.0, 30.0]) * row
+        place = base[row, :3, :3] @ turned([0.0, 0.0, 1.0], azimuth)
+        lines.append(arc(angle, share, length) @ place.T + base[row, :3, 3])
+        aims.append(place @ torch.tensor([math.sin(angle), 0.0, math.cos(angle)]).double())
+    line, aim = torch.stack(lines), torch.stack(aims)
+    found = ArcBackbone.of(13)
+    given = line[:, -1:].float(), base.float()
+    torch.testing.assert_close(found.centreline(*given).double(), line, rtol=0, atol=1e-4)
+    torch.testing.assert_close(found.tip_direction(*given).double(), aim, rtol=0, atol=2e-6)
+    alone = found.centreline(arc(angle, share)[-1:].float()).double()
+    torch.testing.assert_close(alone, arc(angle, share), rtol=0, atol=1e-4)
+
+
+def test_a_tip_behind_its_base_has_a_finite_body():
+    tip = torch.tensor([[[0.0, 0.0, -70.0]], [[0.0, 0.0, 0.0]]])
+    assert ArcBackbone.of(5).centreline(tip).isfinite().all()
+    assert ArcBackbone.of(5).tip_direction(tip).isfinite().all()
+
+
+def tip_at(bend: float, azimuth: float = 0.4) -> torch.Tensor:
+    """(1, 3) mm: end of an arc of 70 mm that turns by `bend`, rad."""
+    x, _, z = arc(bend, torch.ones(1, dtype=torch.float64))[0].tolist()
+    return torch.tensor([[x * math.cos(azimuth), x * math.sin(azimuth), z]])
+
+
+@pytest.mark.parametrize(
+    ("chambers", "length_mm", "bend", "message"),
+    [
+        (4, 70.0, 1.0, None),
+        (3, None, 1.0, None),
+        (3, 84.0, 1.0, None),
+        (3, 59.0, 1.0, None),
+        (5, 70.0, 1.0, "has 5 chambers, several segments with one key point"),
+        (3, 90.0, 1.0, "states a length of 90 mm, and the arc from the origin .* has 70 mm"),
+        (3, None, 1.2, "has its only key point 34 degrees from the z axis at rest, expected at"),
+        (3, None, 6.0, "has its only key point 172 degrees"),
+    ],
+)
+def test_an_arc_is_refused_where_it_is_not_the_body(chambers, length_mm, bend, message):
+    spec = ArmSpec(chambers, 1, (0.0,) * chambers, (1.0,) * chambers, length_mm=length_mm)
+    if message is None:
+        require_body(spec, tip_at(bend), "arm 'a'")
+        return
+    with pytest.raises(InputError, match=f"^arm 'a' {message}.*track_body take it as it is$"):
+        require_body(spec, tip_at(bend), "arm 'a'")
+    many = ArmSpec(chambers, 2, spec.low, spec.high, length_mm=length_mm)
+    require_body(many, torch.cat((torch.zeros(1, 3), tip_at(bend))), "arm 'a'")

@@ -28,6 +28,7 @@ EXTRA_OF = {
     "distributed": "cluster",
     "ezc3d": "lab",
     "h5py": "lab",
+    "lerobot": "lerobot",
     "mcap": "mcap",
     "mcap_ros2": "mcap",
     "nibabel": "segmentation",

@@ -167,3 +167,13 @@ def test_the_plugins_schedule_drives_its_rig(lerobot, tmp_path):
     rig.connect()
     assert rig.send_action(teleoperator.get_action()) == {"c1_kPa": 4, "c2_kPa": 5, "c3_kPa": 6}
     rig.disconnect()
+
+
+def test_the_plugin_names_the_extra_where_lerobot_is_missing(monkeypatch):
+    monkeypatch.syspath_prepend(str(PLUGIN))
+    monkeypatch.setitem(sys.modules, "lerobot", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'surgisoft\[lerobot\]'"):
+        importlib.import_module("lerobot_robot_surgisoft")
+    assert tomllib.loads((PLUGIN / "pyproject.toml").read_text())["project"]["dependencies"] == [
+        "surgisoft[lerobot]"
+    ]

@@ -1,4 +1,4 @@
-"""`InputError`, the one error type for bad input from outside: files, options, names."""
+"""`InputError`, the one error type for bad input from outside: files, options, names; warnings."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -28,6 +28,10 @@ class Interrupted(KeyboardInterrupt):
     def __init__(self, result: Any):
         super().__init__()
         self.result = result
+
+
+class AssumptionWarning(UserWarning):
+    """What a result rests on and no data check: one line, which the command line prints."""
 
 
 def one_line(text: str) -> str:

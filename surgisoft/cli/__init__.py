@@ -1,11 +1,13 @@
 """The command line: one thin function per command, one line for a bad input, exit code 2."""
 
 import atexit
+import functools
 import gc
 import os
 import sys
 import threading
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import NoReturn
@@ -13,7 +15,7 @@ from typing import NoReturn
 import typer
 from typer.exceptions import TyperException
 
-from surgisoft.errors import InputError
+from surgisoft.errors import AssumptionWarning, InputError
 from surgisoft.extras import missing_library
 from surgisoft.files import noted_writes
 
@@ -177,8 +179,24 @@ def left_behind(written: Sequence[Path]) -> str:
 
 def run(arguments: list[str] | None = None) -> int:
     """Run one command and return the exit code: 0, 2 for bad input, 130 after Ctrl-C."""
-    with noted_writes() as written:
+    with noted_writes() as written, warnings.catch_warnings():
+        warnings.showwarning = functools.partial(_show, warnings.showwarning, set())
         return _run(arguments, written)
+
+
+def _show(
+    otherwise: Callable[..., None],
+    printed: set[str],
+    message: Warning | str,
+    category: type,
+    *place,
+) -> None:
+    """Print an `AssumptionWarning` once, as a line of warning; any other warning goes on."""
+    if not issubclass(category, AssumptionWarning):
+        otherwise(message, category, *place)
+    elif str(message) not in printed:
+        printed.add(str(message))
+        print(f"surgisoft: warning: {message}", file=sys.stderr)
 
 
 def _run(arguments: list[str] | None, written: list[Path]) -> int:

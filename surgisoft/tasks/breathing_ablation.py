@@ -161,8 +161,8 @@ class BreathingAblation(RingTask[RingCut]):
     def tissue_error_mm(self, state: TaskState[RingCut]) -> Tensor:
         """(B,) mm: distance of the beam's axis from the place on the organ that is to be cut."""
         here = self._moved(state, self.resting_mm(state))
-        points = state.world.arms[LASER].points_mm
-        return self.pointing[LASER].offset_mm(points, here).norm(dim=1)
+        part = state.world.arms[LASER]
+        return self.pointing[LASER].offset_mm(part.points_mm, here, part.mount).norm(dim=1)
 
     def fires(self, state: TaskState[RingCut]) -> Tensor:
         """(B,) bool: whether the beam would be on: where it is `released`; with `gated` only while

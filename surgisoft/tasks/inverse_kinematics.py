@@ -110,12 +110,16 @@ class Pointing:
     def __init__(self, arm: Arm, dt_s: float):
         self.arm, self.dt_s = arm, dt_s
 
-    def offset_mm(self, points_mm: Tensor, target_mm: Tensor) -> Tensor:
+    def offset_mm(
+        self, points_mm: Tensor, target_mm: Tensor, mount: Tensor | None = None
+    ) -> Tensor:
         """(B, 3) mm: perpendicular offset of targets (B, 3) mm from the tip's axis.
 
-        points_mm: key points (B, n, 3) mm. For a target behind the tip the axis ends at the tip.
+        points_mm: key points (B, n, 3) mm; mount: (B, 4, 4) mm, base frame of the arm, from which
+        the axis of an arm with one key point follows; None: the nominal one. All in the world
+        frame. For a target behind the tip the axis ends at the tip.
         """
-        aim = self.arm.backbone.tip_direction(points_mm)
+        aim = self.arm.backbone.tip_direction(points_mm, self.arm.pose if mount is None else mount)
         away = target_mm - points_mm[:, -1]
         along = (away * aim).sum(1, keepdim=True).clamp(min=0.0)
         return away - along * aim
@@ -127,7 +131,8 @@ class Pointing:
             low, high = self.arm.within_reach(part, self.dt_s)
 
             def residual(pressure: Tensor) -> Tensor:
-                return self.offset_mm(self.arm.predict(part, pressure, self.dt_s), target)
+                points = self.arm.predict(part, pressure, self.dt_s)
+                return self.offset_mm(points, target, part.mount)
 
             wanted = least_squares(residual, part.pressure, low, high)
             return self.arm.action_for(part, wanted, self.dt_s)

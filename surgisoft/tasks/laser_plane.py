@@ -43,6 +43,7 @@ def laser_plane(
     """The beam of one arm follows a circle of 20 mm diameter on a plane 40 mm beyond the tip."""
     config = config or LaserPlaneConfig()
     world = level_world(config.world, config.mean_kPa, config.follow.arm, device)
+    world.arms["arm"].model.require_body("arm 'arm'")
     start = points_at_start(world)
     height = start[0, -1, 2] + config.distance_mm
     spot = BeamSpot(world.arms["arm"], height)
@@ -61,11 +62,11 @@ class BeamSpot:
     height_mm: Tensor
     """() mm: z of the plane, world frame."""
 
-    def __call__(self, points_mm: Tensor) -> Tensor:
-        """(B, 3) mm, world frame, for key points (B, n, 3) mm."""
-        return on_plane(
-            points_mm[:, -1], self.arm.backbone.tip_direction(points_mm), self.height_mm
-        )
+    def __call__(self, points_mm: Tensor, mount: Tensor | None = None) -> Tensor:
+        """(B, 3) mm, world frame, for key points (B, n, 3) mm and a mount, see `Marker`."""
+        mount = self.arm.pose if mount is None else mount
+        aim = self.arm.backbone.tip_direction(points_mm, mount)
+        return on_plane(points_mm[:, -1], aim, self.height_mm)
 
 
 def on_plane(origin_mm: Tensor, direction: Tensor, height_mm: Tensor | float) -> Tensor:

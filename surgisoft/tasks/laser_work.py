@@ -40,7 +40,7 @@ from surgisoft.tasks.observations import (
 )
 from surgisoft.tasks.trajectories.closed_path import RingCut, point_on_closed
 from surgisoft.tasks.trajectories.routes import RouteProgress
-from surgisoft.tasks.world.arm import ArmPart
+from surgisoft.tasks.world.arm import ArmPart, as_known
 from surgisoft.tasks.world.pytree import TensorDataclass
 from surgisoft.tasks.world.random_streams import Stream
 from surgisoft.tasks.world.scene import (
@@ -347,10 +347,15 @@ class LaserTask(ABC, Generic[Progress]):
         arms = state.world.arms
         if state.world.scene.measured:  # an exported controller poses them so
             return arms
-        if all(torch.equal(part.seen_mm, part.points_mm) for part in arms.values()):
+        if all(
+            torch.equal(part.seen_mm, part.points_mm)
+            and (part.known_mount is None or torch.equal(part.known_mount, part.mount))
+            for part in arms.values()
+        ):
             return arms
         return {
-            name: self.world.arms[name].posed(part, part.seen_mm) for name, part in arms.items()
+            name: self.world.arms[name].posed(as_known(part), part.seen_mm)
+            for name, part in arms.items()
         }
 
     def on_organ(self, state: TaskState[Progress], lasers: tuple[str, ...]) -> list[Tensor]:
@@ -402,14 +407,19 @@ class OneLaserTask(LaserTask[Progress]):
 
     def beam_error_mm(self, state: TaskState[Progress]) -> Tensor:
         """(B,) mm: true perpendicular distance of the beam's axis from its target."""
-        return self._off_target_mm(state, state.world.arms[LASER].points_mm)
+        part = state.world.arms[LASER]
+        return self._off_target_mm(state, part.points_mm, part.mount)
 
     def measured_error_mm(self, state: TaskState[Progress]) -> Tensor:
         """(B,) mm: distance of the beam's axis from its target as measured or estimated."""
-        return self._off_target_mm(state, state.world.arms[LASER].seen_mm)
+        part = state.world.arms[LASER]
+        return self._off_target_mm(state, part.seen_mm, part.known_mount)
 
-    def _off_target_mm(self, state: TaskState[Progress], points_mm: Tensor) -> Tensor:
-        return self.pointing[LASER].offset_mm(points_mm, self.target_mm(state)).norm(dim=1)
+    def _off_target_mm(
+        self, state: TaskState[Progress], points_mm: Tensor, mount: Tensor | None
+    ) -> Tensor:
+        point = self.pointing[LASER]
+        return point.offset_mm(points_mm, self.target_mm(state), mount).norm(dim=1)
 
     def released(self, state: TaskState[Progress]) -> Tensor:
         """(B,) bool: as far as is measured the beam is near its target and meets the organ, the
@@ -457,8 +467,10 @@ class OneLaserTask(LaserTask[Progress]):
         arms, point = state.world.arms, self.pointing
         laser, eye = arms[LASER], arms[ENDOSCOPE]
         ahead = [self.target_mm(state, k) for k in range(self.config.preview + 1)]
-        offsets = [point[LASER].offset_mm(laser.steered_mm, target) for target in ahead]
-        look = point[ENDOSCOPE].offset_mm(eye.steered_mm, self.watched_mm(state))
+        offsets = [
+            point[LASER].offset_mm(laser.steered_mm, target, laser.known_mount) for target in ahead
+        ]
+        look = point[ENDOSCOPE].offset_mm(eye.steered_mm, self.watched_mm(state), eye.known_mount)
         own: dict[str, ObservationBlocks] = {
             LASER: {
                 **numbered(BEAM_ERROR, [offset.asinh() for offset in offsets]),

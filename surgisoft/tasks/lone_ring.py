@@ -64,7 +64,7 @@ class LoneRing:
                 arm.beside,
                 band,
             )
-            width = 3 * (keys - 1) + 4 * arm.command.shape[1]
+            width = 3 * max(keys - 1, 1) + 4 * arm.command.shape[1]
             more = 3 * len(self._targets) + 3 if name == LASER else 3
             self._seen[name] = np.empty(width + more + 6, np.float32)
             self._blocks[name] = width
@@ -253,7 +253,7 @@ def _offsets(laser, aim, eye, axis, targets, watched, errors, of_laser, at_laser
 def _body(points, base, command, pressure, low, high, beside, band, direction, anchor, out):
     """Blocks of an arm's body, see `observations.body_blocks`."""
     at, chambers = 0, len(low)
-    for k in range(1, points.shape[1]):
+    for k in range(min(1, points.shape[1] - 1), points.shape[1]):
         for i in range(3):
             out[at] = (points[0, k, i] - base[i]) / np.float32(SHAPE_MM)
             at += 1

@@ -104,9 +104,14 @@ REVERSAL = Block(
 TIME = Block("time", "elapsed share of the episode", "-", "x", 0.0, 1.0)
 
 
+def free_points(points_mm: Tensor) -> Tensor:
+    """(B, k, 3) mm: the key points (B, n, 3) mm without the base, which is the first of several."""
+    return points_mm[:, min(1, points_mm.shape[1] - 1) :]
+
+
 def body_blocks(arm: Arm, part: ArmPart) -> ObservationBlocks:
     """Observation blocks of an arm's body: measured key points and pressures."""
-    shape = ((part.steered_mm - arm.pose[:3, 3])[:, 1:] / 50.0).flatten(1)
+    shape = (free_points(part.steered_mm - arm.pose[:3, 3]) / 50.0).flatten(1)
     return {SHAPE: shape, **pressure_blocks(arm, part)}
 
 

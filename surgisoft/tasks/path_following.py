@@ -17,6 +17,7 @@ from surgisoft.tasks.observations import (
     Block,
     ObservationBlocks,
     asinh_of,
+    free_points,
     joined,
     numbered,
     pressure_blocks,
@@ -155,6 +156,11 @@ class FollowGoal:
     """The last steps."""
 
 
+Marker = Callable[[Tensor, Tensor | None], Tensor]
+"""Key points (B, n, 3) mm and mount (B, 4, 4) mm of an arm, None for the nominal one, to the point
+(B, 3) mm that follows; world frame."""
+
+
 class Follow:
     """One arm in empty space, one of whose points follows a closed path."""
 
@@ -165,15 +171,14 @@ class Follow:
         name: str,
         world: World,
         config: FollowConfig,
-        marker: Callable[[Tensor], Tensor],
+        marker: Marker,
         centre_mm: Tensor,
         directions: int,
     ):
         """Build the task for a level path with its centre at centre_mm, (3,) mm.
 
-        marker: function from key points (B, n, 3) mm to the point (B, 3) mm that follows, world
-        frame. The expert controls the first `directions` coordinates of that point: 2 where the
-        third is constant.
+        marker: see `Marker`. The expert controls the first `directions` coordinates of that
+        point: 2 where the third is constant.
         """
         self.name, self.world, self.config = name, world, config
         self.marker, self.centre = marker, centre_mm
@@ -205,8 +210,7 @@ class Follow:
 
     def error_mm(self, state: TaskState[FollowGoal]) -> Tensor:
         """(B,) mm: distance of the true point from its target."""
-        point = self.marker(state.world.arms["arm"].points_mm)
-        return (point - self.target_mm(state)).norm(dim=1)
+        return (self._marked(state) - self.target_mm(state)).norm(dim=1)
 
     def advance(
         self, state: TaskState[FollowGoal], actions: Mapping[str, Tensor]
@@ -215,7 +219,8 @@ class Follow:
         before = state.world.arms["arm"]
         world = self.world.step(state.world, actions)
         after = world.arms["arm"]
-        moved = self.marker(after.seen_mm) - self.marker(before.seen_mm)
+        moved = self.marker(after.seen_mm, after.known_mount)
+        moved = moved - self.marker(before.seen_mm, before.known_mount)
         history = state.goal.history.after(after.seen_kPa - before.seen_kPa, moved)
         return TaskState(world, replace(state.goal, history=history))
 
@@ -226,17 +231,17 @@ class Follow:
         two and the predicted one are also scaled with `fine_mm`.
         """
         part, history = state.world.arms["arm"], state.goal.history
-        point = self.marker(part.steered_mm)
+        point = self.marker(part.steered_mm, part.known_mount)
         preview = self.config.preview
         targets = [self.target_mm(state, ahead) for ahead in range(max(preview, 1) + 1)]
         errors = [target - point for target in targets[: preview + 1]]
         close = errors[:2]
         if self.config.one_step_prediction:
-            close = [*close, targets[1] - self.marker(self._held(part))]
+            close = [*close, targets[1] - self.marker(self._held(part), part.known_mount)]
         scaled = asinh_of([*errors, *(error / self.config.fine_mm for error in close)])
         wide, fine = scaled[: len(errors)], scaled[len(errors) :]
         blocks = {
-            SHAPE: (part.steered_mm - self._rest)[:, 1:].flatten(1) / 10.0,
+            SHAPE: free_points(part.steered_mm - self._rest).flatten(1) / 10.0,
             **numbered(ERROR, wide),
             **numbered(FINE, fine[: len(errors[:2])]),
         }
@@ -282,14 +287,20 @@ class Follow:
 
     def trace(self, state: TaskState[FollowGoal]) -> tuple[Tensor, Tensor]:
         """The target and the true point, each (B, 1, 3) mm."""
-        point = self.marker(state.world.arms["arm"].points_mm)
-        return self.target_mm(state)[:, None], point[:, None]
+        return self.target_mm(state)[:, None], self._marked(state)[:, None]
 
     def script(self, state: TaskState[FollowGoal]) -> dict[str, Tensor]:
         """Scripted expert: inverse kinematics for the point on the next target."""
 
-        def error(points: Tensor, target: Tensor) -> Tensor:
-            return (self.marker(points) - target)[:, : self._directions]
+        def error(points: Tensor, wanted: Tensor) -> Tensor:
+            target, mount = wanted[:, :3], wanted[:, 3:].unflatten(1, (4, 4))
+            return (self.marker(points, mount) - target)[:, : self._directions]
 
-        part, target = state.world.arms["arm"], self.target_mm(state, 1)
-        return {"arm": action_towards(self.arm, part, target, error, self.dt_s)}
+        part = state.world.arms["arm"]
+        wanted = torch.cat((self.target_mm(state, 1), part.mount.flatten(1)), 1)
+        return {"arm": action_towards(self.arm, part, wanted, error, self.dt_s)}
+
+    def _marked(self, state: TaskState[FollowGoal]) -> Tensor:
+        """(B, 3) mm: the true point that follows."""
+        part = state.world.arms["arm"]
+        return self.marker(part.points_mm, part.mount)

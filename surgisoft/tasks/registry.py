@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import sys
+import warnings
 from collections.abc import Mapping
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -19,7 +20,8 @@ from typing import Any
 import torch
 
 from surgisoft.config import Where, from_table, merged, read_toml, to_table
-from surgisoft.errors import InputError, unknown_name
+from surgisoft.errors import AssumptionWarning, InputError, unknown_name
+from surgisoft.surrogate.backbone import TIP_TASKS
 from surgisoft.tasks.area_ablation import AREA_ABLATION
 from surgisoft.tasks.arguments import check_path, device_of, whole
 from surgisoft.tasks.base import DocumentedTask, Task
@@ -109,7 +111,8 @@ def make_task(name: str, config: Any = None, device: str | torch.device = "cpu")
     """Build the named task; without a config with its default one.
 
     Raises InputError for an episode of no step or of more than `MOST_STEPS`, and for a count in the
-    configuration of one of the package's tasks above `MOST_COUNT`.
+    configuration of one of the package's tasks above `MOST_COUNT`. Warns (`AssumptionWarning`)
+    where only the tip of an arm was measured and the task needs more of it.
     """
     spec = spec_of(name)
     if name in TASKS:
@@ -131,7 +134,21 @@ def make_task(name: str, config: Any = None, device: str | torch.device = "cpu")
             f"{name}: an episode of no step; expected longer times or a shorter dt_s in its "
             "configuration"
         )
+    _say_assumed(task)
     return task
+
+
+def _say_assumed(task: DocumentedTask) -> None:
+    """Warn where the body of an arm in a task is an assumption."""
+    arcs = [name for name, arm in task.world.arms.items() if arm.key_points == 1]
+    if arcs and task.name not in TIP_TASKS:
+        named = " and ".join(f"'{name}'" for name in arcs)
+        warnings.warn(
+            f"{task.name}: only the tip of arm {named} was measured; body and tip axis are those "
+            "of an arc of constant curvature from the base to the tip, which no data check",
+            AssumptionWarning,
+            stacklevel=3,
+        )
 
 
 def _check_counts(name: str, config: Any, place: str = "") -> None:

@@ -45,8 +45,8 @@ TRACK_CIRCLE = TaskSpec(track_circle, TrackConfig(), ("arm",), FOLLOW_PRESET, FO
 TRACK_SQUARE = TaskSpec(track_square, SQUARE, ("arm",), FOLLOW_PRESET, FOLLOW_STEPS)
 
 
-def tip(points_mm: Tensor) -> Tensor:
-    """(B, 3) mm: the tip, which is the last of the key points (B, n, 3) mm."""
+def tip(points_mm: Tensor, mount: Tensor | None = None) -> Tensor:
+    """(B, 3) mm: the tip, which is the last of the key points (B, n, 3) mm, wherever the mount."""
     return points_mm[:, -1]
 
 

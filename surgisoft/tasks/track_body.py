@@ -17,6 +17,7 @@ from surgisoft.tasks.inverse_kinematics import action_towards
 from surgisoft.tasks.observations import (
     Block,
     ObservationBlocks,
+    free_points,
     joined,
     numbered,
     pressure_blocks,
@@ -127,8 +128,9 @@ class TrackBody:
         return self.arm.settled(torch.minimum(torch.maximum(pressure, self.arm.low), self.arm.high))
 
     def errors_mm(self, state: TaskState[Waves]) -> Tensor:
-        """(B, n - 1) mm: distance of each true key point but the base from its target."""
-        return (state.world.arms["arm"].points_mm - self.target_mm(state)).norm(dim=2)[:, 1:]
+        """(B, k) mm: distance of each true key point but the base from its target."""
+        off = state.world.arms["arm"].points_mm - self.target_mm(state)
+        return free_points(off).norm(dim=2)
 
     def advance(self, state: TaskState[Waves], actions: Mapping[str, Tensor]) -> TaskState[Waves]:
         """Advance the arm one step."""
@@ -138,10 +140,10 @@ class TrackBody:
         """Observation blocks: body, errors of all key points now and ahead, and time."""
         part = state.world.arms["arm"]
         ahead = [self.target_mm(state, k) for k in range(self.config.preview + 1)]
-        errors = [(target - part.steered_mm)[:, 1:].flatten(1).asinh() for target in ahead]
+        errors = [free_points(target - part.steered_mm).flatten(1).asinh() for target in ahead]
         return {
             "arm": {
-                SHAPE: (part.steered_mm - self._rest)[:, 1:].flatten(1) / 10.0,
+                SHAPE: free_points(part.steered_mm - self._rest).flatten(1) / 10.0,
                 **numbered(ERROR, errors),
                 **pressure_blocks(self.arm, part),
                 TIME: 2.0 * state.world.steps[:, None] / self.steps - 1.0,
@@ -178,7 +180,7 @@ class TrackBody:
         """Scripted expert: inverse kinematics for all key points at once, one step ahead."""
 
         def error(points: Tensor, target: Tensor) -> Tensor:
-            return (points - target)[:, 1:].flatten(1)
+            return free_points(points - target).flatten(1)
 
         part, target = state.world.arms["arm"], self.target_mm(state, 1)
         return {"arm": action_towards(self.arm, part, target, error, self.dt_s, STUCK_MM)}

@@ -220,21 +220,26 @@ class TwoLaserRing(LaserTask[SharedCut]):
 
     def beam_errors_mm(self, state: TaskState[SharedCut]) -> Tensor:
         """(B, 2) mm: true perpendicular distance of each beam's axis from its target."""
-        return self._off_targets_mm(state, [state.world.arms[n].points_mm for n in LASERS])
+        arms = [state.world.arms[name] for name in LASERS]
+        return self._off_targets_mm(state, [(part.points_mm, part.mount) for part in arms])
 
     def measured_errors_mm(self, state: TaskState[SharedCut]) -> Tensor:
         """(B, 2) mm: distance of each beam's axis from its target as measured or estimated."""
-        return self._off_targets_mm(state, [state.world.arms[n].seen_mm for n in LASERS])
+        arms = [state.world.arms[name] for name in LASERS]
+        return self._off_targets_mm(state, [(part.seen_mm, part.known_mount) for part in arms])
 
     def measured_error_mm(self, state: TaskState[SharedCut]) -> Tensor:
         """(B,) mm: the larger of the two lasers' measured errors."""
         return self.measured_errors_mm(state).amax(1)
 
-    def _off_targets_mm(self, state: TaskState[SharedCut], points_mm: list[Tensor]) -> Tensor:
+    def _off_targets_mm(
+        self, state: TaskState[SharedCut], bodies: list[tuple[Tensor, Tensor | None]]
+    ) -> Tensor:
+        """(B, 2) mm: bodies: key points (B, n, 3) mm and mount of each laser, see `Pointing`."""
         point, targets = self.pointing, self.targets_mm(state)
         off = [
-            point[name].offset_mm(points, target).norm(dim=1)
-            for name, points, target in zip(LASERS, points_mm, targets, strict=True)
+            point[name].offset_mm(points, target, mount).norm(dim=1)
+            for name, (points, mount), target in zip(LASERS, bodies, targets, strict=True)
         ]
         return torch.stack(off, 1)
 
@@ -319,8 +324,8 @@ class TwoLaserRing(LaserTask[SharedCut]):
         seen, fired = self.spots_seen(state).float(), cut.fired.float()
         own: dict[str, ObservationBlocks] = {}
         for k, name in enumerate(LASERS):
-            at = arms[name].steered_mm
-            offsets = [point[name].offset_mm(at, targets[k]) for targets in ahead]
+            at, mount = arms[name].steered_mm, arms[name].known_mount
+            offsets = [point[name].offset_mm(at, targets[k], mount) for targets in ahead]
             angle = 2.0 * math.pi * cut.share(k, self.round)[:, None]
             own[name] = {
                 **numbered(BEAM_ERROR, [offset.asinh() for offset in offsets]),
@@ -331,7 +336,8 @@ class TwoLaserRing(LaserTask[SharedCut]):
                 SPOTS: seen.roll(-k, 1),
                 FIRED: fired.roll(-k, 1),
             }
-        look = point[ENDOSCOPE].offset_mm(arms[ENDOSCOPE].steered_mm, self.centre_mm(state))
+        eye = arms[ENDOSCOPE]
+        look = point[ENDOSCOPE].offset_mm(eye.steered_mm, self.centre_mm(state), eye.known_mount)
         own[ENDOSCOPE] = {VIEW_ERROR: look.asinh(), SPOTS: seen, FIRED: fired}
         return {
             name: {

@@ -19,13 +19,13 @@ from torch import Tensor
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
 from surgisoft.surrogate.arm import ArmSpec, ArmState
-from surgisoft.surrogate.backbone import Backbone
+from surgisoft.surrogate.backbone import LEAST_SINE, STRAIGHT_RAD, ArcBackbone, Backbone
 from surgisoft.surrogate.compiled_step import CompiledStep
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.units import KPA_PER
 from surgisoft.tasks.world.adaptation import AdaptationPrior, DisturbanceEstimator
 from surgisoft.tasks.world.arm_errors import ErrorPrior
-from surgisoft.tasks.world.compiled_arm import draw_body, drive, place
+from surgisoft.tasks.world.compiled_arm import draw_arc, draw_body, drive, place
 from surgisoft.tasks.world.observer import AlphaBetaFilter, Belief
 from surgisoft.tasks.world.random_effects import RandomEffects
 from surgisoft.tasks.world.random_streams import Stream
@@ -183,6 +183,9 @@ class ArmPart:
     because motion comes late (`adaptation`); None without an observer that learns."""
     factors: Tensor | None = None
     """(B, K): factors of the episode's random effects; None without any."""
+    known_mount: Tensor | None = None
+    """(B, 4, 4): base frame to world frame as far as controllers know it, mm: the nominal mount,
+    and the feed. None for arms with two key points or more, whose body needs no base."""
 
     @property
     def model_beside(self) -> ArmState:
@@ -198,6 +201,11 @@ class ArmPart:
     def tip_mm(self) -> Tensor:
         """(B, 3) mm: the last key point."""
         return self.points_mm[:, -1]
+
+
+def as_known(part: ArmPart) -> ArmPart:
+    """The part on the mount that controllers know, where its body depends on that."""
+    return part if part.known_mount is None else replace(part, mount=part.known_mount)
 
 
 class Arm(Protocol):
@@ -219,7 +227,7 @@ class Arm(Protocol):
     """n, number of key points, base and tip included."""
     model: ArmModel
     """The fitted arm model: policies and experts predict with it."""
-    backbone: Backbone
+    backbone: Backbone | ArcBackbone
     """The curve through the key points."""
     pneumatics: Pneumatics
     """The pneumatic actuators."""
@@ -322,6 +330,13 @@ class ModelArm:
         self.shaft = torch.tensor([[0.0, 0.0, -mounted.shaft_mm]], **row)
         self.shaft = self.shaft if mounted.shaft_mm > 0.0 else self.shaft[:0]
         self._compiled = CompiledStep.of(self.model) if device.type == "cpu" else None
+        curve = self.backbone
+        if isinstance(curve, ArcBackbone):
+            self.samples, matrices = len(curve.share), [curve.share]
+        else:
+            self.samples = len(curve.position)
+            matrices = [curve.position, curve.derivative[-1].contiguous()]
+        self._drawn = tuple(t.cpu().numpy() for t in (self.shaft, *matrices))
         self._random_effects = RandomEffects(self.model) if randomisation.effects_mm > 0 else None
         self._learner = None
         if self.observer.adapts:
@@ -381,11 +396,12 @@ class ModelArm:
             arm=state,
             points_mm=points,
             line_mm=self._line(points, mount),
-            tip_direction=self.backbone.tip_direction(points),
+            tip_direction=self.backbone.tip_direction(points, mount),
             seen_mm=points,
             seen_kPa=pressure,
             offset_mm=torch.zeros_like(points),
             factors=factors,
+            known_mount=self.pose.repeat(count, 1, 1) if self.key_points == 1 else None,
         )
         stream, part = self._measured(stream, part)
         if self.observer.raw:
@@ -481,7 +497,7 @@ class ModelArm:
             line, direction = self._body(points_mm, part.mount)
         else:
             line = self._line(points_mm, part.mount)
-            direction = self.backbone.tip_direction(points_mm)
+            direction = self.backbone.tip_direction(points_mm, part.mount)
         return replace(part, points_mm=points_mm, line_mm=line, tip_direction=direction)
 
     def _compiled_for(self, *tensors: Tensor) -> CompiledStep | None:
@@ -550,28 +566,36 @@ class ModelArm:
 
         points_mm: contiguous; read when the rows are worked on.
         """
-        count, position = len(points_mm), self.backbone.position
-        line = points_mm.new_empty(count, len(self.shaft) + len(position), 3)
-        direction = points_mm.new_empty(count, 3)
-        given = [t.contiguous().numpy() for t in (points_mm, mount)]
-        backbone = (position.numpy(), self.backbone.derivative[-1].numpy())
-        shaft, found = self.shaft.numpy(), [t.numpy() for t in (line, direction)]
+        line = points_mm.new_empty(len(points_mm), len(self.shaft) + self.samples, 3)
+        direction = points_mm.new_empty(len(points_mm), 3)
+        arrays = [t.numpy() for t in (points_mm, mount.contiguous(), line, direction)]
+        return line, direction, lambda rows: self.draw(*(array[rows] for array in arrays))
 
-        def draw(rows: slice) -> None:
-            draw_body(*(a[rows] for a in given), shaft, *backbone, *(a[rows] for a in found))
+    def draw(self, points: np.ndarray, mounts: np.ndarray, line: Any, direction: Any) -> None:
+        """Fill line (B, K, 3) mm and direction (B, 3) from key points (B, n, 3) mm, compiled.
 
-        return line, direction, draw
+        mounts: (B, 4, 4); all in the world frame, and line and direction tensors or arrays.
+        """
+        into = np.asarray(line), np.asarray(direction)
+        if isinstance(self.backbone, ArcBackbone):
+            limits = np.float32(STRAIGHT_RAD), np.float32(LEAST_SINE)
+            draw_arc(points, mounts, *self._drawn, *limits, *into)
+        else:
+            draw_body(points, mounts, *self._drawn, *into)
 
     def alone(self, part: ArmPart, dt_s: float) -> LoneArm | None:
         """Steps of one environment's arm in kept arrays; None where the reference has to step it.
 
         It has to where the model cannot be compiled, where measurements have noise, where an
-        observer estimates the key points, and where the arm has random effects.
+        observer estimates the key points, where the arm has random effects, and where the axis of
+        an arm with one key point is not the one that controllers know.
         """
         vary = self.vary
         plain = self.observer.raw and vary.noise_mm == vary.noise_kPa == 0.0
         plain = plain and part.plant is None and part.belief is None and part.factors is None
         plain = plain and len(part.command) == 1
+        if part.known_mount is not None:  # what is seen has the nominal base
+            plain = plain and vary.mount_mm == vary.mount_rad == 0.0
         return LoneArm(self, self._compiled, part, dt_s) if plain and self._compiled else None
 
     def within_reach(self, part: ArmPart, dt_s: float) -> tuple[Tensor, Tensor]:
@@ -599,7 +623,7 @@ class ModelArm:
         return queue[:, 1:], queue.gather(1, place)[:, 0]
 
     def _line(self, points: Tensor, mount: Tensor) -> Tensor:
-        line = self.backbone.centreline(points)
+        line = self.backbone.centreline(points, mount)
         return torch.cat((frames.apply(mount, self.shaft), line), 1) if len(self.shaft) else line
 
     def _moved(self, normal: Tensor) -> Tensor:
@@ -661,7 +685,7 @@ class LoneArm:
     """
 
     def __init__(self, arm: ModelArm, step: CompiledStep, part: ArmPart, dt_s: float):
-        self._part, backbone = part, arm.backbone
+        self._part, self._arm = part, arm
         self.command, self.pressure, queue, self.delay, self.gain, self.mount = (
             _copied(t)
             for t in (part.command, part.pressure, part.queue, part.delay, part.gain, part.mount)
@@ -685,17 +709,13 @@ class LoneArm:
             # The loop reads each entry before it writes it.
             *(self.command, self.pressure, queue, self.beside),
         )
-        self._body = (
-            *(self.points_mm, self.mount, arm.shaft.numpy(), backbone.position.numpy()),
-            *(backbone.derivative[-1].contiguous().numpy(), self.line_mm, self.tip_direction),
-        )
 
     def step(self) -> None:
         """Advance one step with the changes of pressure in `action`."""
         drive(*self._drive)
         self.model.step()
         place(self.model.points_mm, self.mount, self.points_mm)
-        draw_body(*self._body)
+        self._arm.draw(self.points_mm, self.mount, self.line_mm, self.tip_direction)
 
     @property
     def part(self) -> ArmPart:

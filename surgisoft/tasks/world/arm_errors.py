@@ -111,13 +111,17 @@ class ArmErrors:
             torch.tensor(row, device=device) for row in zip(*pairs, strict=True)
         )
         body = torch.tensor(steady_key_points(model, rest[None])[0])
+        self.based = n == 1
+        """The base takes part as a key point before the only one, which has no segment else."""
+        if self.based:
+            body = torch.cat((torch.zeros_like(body), body))
         self.axes = torch.eye(3, device=device)
         self.tangents = Backbone.at_key_points(body).derivative.to(device)
         self.lengths = tensor(np.linalg.norm(np.diff(body.numpy(), axis=0), axis=1))
-        beyond = np.tril(np.ones((n, n)), -1)[:, : n - 1]
+        beyond = np.tril(np.ones((len(body), len(body))), -1)[:, :-1]
         self.beyond = tensor(beyond)
-        """(n, n - 1): 1 for key points beyond a segment."""
-        body = body.to(dtype=torch.float32, device=device)
+        """(n, n - 1): 1 for key points beyond a segment; the base counts where it takes part."""
+        body = body[-n:].to(dtype=torch.float32, device=device)
         self.count: int = self.displacements(self.rest[None], body[None]).shape[2]
         """Number F of parameters."""
 
@@ -149,6 +153,8 @@ class ArmErrors:
     def _body(self, one: Tensor, points: Tensor) -> list[Tensor]:
         """Errors of the segments, and of the key planes' places, each (B, n, 3, ...) mm."""
         prior = self.prior
+        if self.based:
+            points = torch.cat((torch.zeros_like(points), points), 1)
         tangent = frames.normalise(self.tangents @ points)
         across = self._across(tangent)
         chord = points[:, 1:] - points[:, :-1]
@@ -170,7 +176,8 @@ class ArmErrors:
         kinds = torch.cat((prior.bend_share * own, loaded.flatten(4)), 4)
         segments = kinds * self.beyond[:, :, None, None]
         planes = torch.stack((*across, tangent), 3)
-        return [segments.movedim(2, 3).flatten(3), self._each_plane(planes)]
+        rows = slice(1 if self.based else 0, None)
+        return [segments[:, rows].movedim(2, 3).flatten(3), self._each_plane(planes[:, rows])]
 
     def _each_plane(self, planes: Tensor) -> Tensor:
         """(B, n, 3, 3 n) mm: shifts of each key point along the axes of its plane.

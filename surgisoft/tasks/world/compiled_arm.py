@@ -88,3 +88,44 @@ def draw_body(points, mounts, shaft, position, tangent, line, direction):
             z += tangent[n] * points[b, n, 2]
         length = max(math.sqrt(x * x + y * y + z * z), 1e-12)
         direction[b, 0], direction[b, 1], direction[b, 2] = x / length, y / length, z / length
+
+
+@compiled
+def draw_arc(points, mounts, shaft, share, straight, least, line, direction):
+    """Centreline and tip direction of arms with one key point (B, 1, 3) mm, world frame.
+
+    share (K,): places on the arc; straight (rad) and least: see `ArcBackbone`, whose formula this
+    is; the other arrays are those of `draw_body`.
+    """
+    ahead, zero = len(shaft), np.float32(0.0)
+    one, two = np.float32(1.0), np.float32(2.0)
+    chord = np.empty(3, np.float32)
+    for b in range(len(points)):
+        t = mounts[b]
+        for s in range(ahead):
+            for i in range(3):
+                total = t[i, 0] * shaft[s, 0] + t[i, 1] * shaft[s, 1] + t[i, 2] * shaft[s, 2]
+                line[b, s, i] = total + t[i, 3]
+        square = along = aside = zero
+        for i in range(3):
+            chord[i] = points[b, 0, i] - t[i, 3]
+            square += chord[i] * chord[i]
+            along += chord[i] * t[i, 2]
+        for i in range(3):
+            off = chord[i] - along * t[i, 2]
+            aside += off * off
+        length = np.float32(math.sqrt(square))
+        ratio = np.float32(math.sqrt(aside)) / max(length + along, np.float32(1e-12))
+        angle = two * np.float32(math.atan(ratio))
+        sine = max(np.float32(math.sin(angle)), np.float32(least))
+        for k in range(len(share)):
+            done, left = share[k], one - share[k]
+            if angle >= straight:
+                done = np.float32(math.sin(done * angle)) / sine
+                left = np.float32(math.sin(left * angle)) / sine
+            for i in range(3):
+                bent = length * done * left * t[i, 2] + done * done * chord[i]
+                line[b, ahead + k, i] = t[i, 3] + bent
+        cosine = along / max(square, np.float32(1e-24))
+        for i in range(3):
+            direction[b, i] = two * cosine * chord[i] - t[i, 2]

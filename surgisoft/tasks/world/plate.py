@@ -39,7 +39,8 @@ def plate_world(
     """
     model = named_arm(arm, device)
     alone = single_arm_world(config, model, device=device).arms["arm"]
-    line = alone.backbone.centreline(alone.settled(alone.first[None]))[0].cpu().double().numpy()
+    rest = alone.settled(alone.first[None])
+    line = alone.backbone.centreline(rest, alone.pose)[0].cpu().double().numpy()
     if not 0.0 < height_mm < line[-1, 2] - plate.thickness_mm:
         raise InputError(
             f"plate: height_mm is {height_mm}, expected above 0 and below the tip at rest, "
@@ -101,7 +102,7 @@ def _along_routes(world: World, arm: Arm, pressure: Tensor) -> tuple[Tensor, Ten
     share = torch.linspace(0.0, 1.0, ROUTE_POINTS, device=pressure.device)[:, None]
     steps = arm.first + share * (pressure[:, None] - arm.first)
     bodies = arm.settled(steps.flatten(0, 1))
-    lines = arm.backbone.centreline(bodies)
+    lines = arm.backbone.centreline(bodies, arm.pose)
     assert world.scene is not None, "the plate"
     clear = world.scene.geometry.clearance({"arm": lines}).least_mm
     return bodies[:, -1].unflatten(0, (-1, ROUTE_POINTS)), clear.unflatten(

@@ -144,6 +144,9 @@ class World:
         self.config, self.device = config or WorldConfig(), torch.device(device)
         self.passive, self.feed = tuple(passive), feed
         self.scene = scene
+        if scene is not None:
+            for name, mounted in arms.items():
+                mounted.model.require_body(f"arm '{name}'")
         c = self.config
         self.arms: dict[str, Arm] = {
             name: ModelArm(
@@ -283,7 +286,13 @@ def fed(part: ArmPart, move_mm: Tensor) -> ArmPart:
     if belief is not None:
         # the feed is known to the observer
         belief = replace(belief, fed_mm=belief.fed_mm + shift[:, None])
-    return replace(part, mount=mount, points_mm=points, seen_mm=seen, belief=belief)
+    known = part.known_mount
+    if known is not None:
+        known = known.clone()
+        known[:, :3, 3] += shift
+    return replace(
+        part, mount=mount, points_mm=points, seen_mm=seen, belief=belief, known_mount=known
+    )
 
 
 def _not_finite(parts: Mapping[str, ArmPart]) -> Tensor:

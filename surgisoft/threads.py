@@ -102,12 +102,18 @@ def over_rows(count: int, work: Callable[[slice], object], block: int = BLOCK) -
 def _pool(threads: int) -> ThreadPoolExecutor:
     """A pool of so many threads, which is kept."""
     if threads not in _pools:
-        before = torch.get_num_threads()
-        pool = ThreadPoolExecutor(threads, "rows", torch.set_num_threads, (1,))
-        wait([pool.submit(threading.Event().wait, 0.01) for _ in range(threads)])
-        torch.set_num_threads(before)  # the initialiser of the others sets MKL's for all
+        before, started = torch.get_num_threads(), threading.Barrier(threads)
+        pool = ThreadPoolExecutor(threads, "rows", _keep_one_thread)
+        wait([pool.submit(started.wait) for _ in range(threads)])
+        torch.set_num_threads(before)  # the others have set it for MKL, which has one number
         _pools[threads] = pool
     return _pools[threads]
+
+
+def _keep_one_thread() -> None:
+    """Let torch work on one thread where this one calls it."""
+    torch.set_num_threads(1)
+    torch.get_num_threads()  # a thread takes over the number when it first asks for it
 
 
 if hasattr(os, "register_at_fork"):

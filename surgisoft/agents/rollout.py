@@ -121,7 +121,8 @@ def rollout(
     """
     if episodes < 1 or batch < 1:
         raise InputError(f"rollout: {episodes} episodes in batches of {batch}, expected 1 or more")
-    parts, total = [], task.steps * -(-episodes // batch)
+    parts: list[Rollout] = []
+    total = task.steps * -(-episodes // batch)
     for number, done in enumerate(range(0, episodes, batch)):
         count, before = min(batch, episodes - done), number * task.steps
         try:

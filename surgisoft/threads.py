@@ -105,7 +105,7 @@ def _pool(threads: int) -> ThreadPoolExecutor:
         before, started = torch.get_num_threads(), threading.Barrier(threads)
         pool = ThreadPoolExecutor(threads, "rows", _keep_one_thread)
         wait([pool.submit(started.wait) for _ in range(threads)])
-        torch.set_num_threads(before)  # the others have set it for MKL, which has one number
+        torch.set_num_threads(before)  # for threads that are started later
         _pools[threads] = pool
     return _pools[threads]
 

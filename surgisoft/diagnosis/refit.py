@@ -9,6 +9,11 @@ effect that a network can hide, and as long without any effect (the rival). Whol
 time where runs are few, are left out in turn, each by a training with another seed, and the errors
 there are compared.
 
+A training may come out badly by chance, and all blocks that it left out then show a gain of every
+effect. Which part of a gain is the effect's is therefore tried before it is named: the network is
+trained on alone from where the training with the effect ended, and the better of the two trainings
+of the network alone counts.
+
 The effort is fixed in epochs and rows, not in seconds, so that the result does not depend on the
 machine. All effects get few epochs; those that come out first get more (successive halving:
 Jamieson & Talwalkar 2016, "Non-stochastic best arm identification").
@@ -557,11 +562,30 @@ def refit(
         if best:
             second = rung(best, config.epochs, first)
             second = {label: _better(split, first[label], second[label]) for label in second}
-    last = {label: second if label in best else first for label in tried}
-    scores = _scores(split, last, sets) if tried else {}
+        last = {label: second if label in best else first for label in tried}
+        scores = _scores(split, last, sets) if tried else {}
+        winner, competing, of_line, sure = _decided(split, _ahead(scores, best), last)
+        checked: set[str] = set()
+        while winner is not None and winner not in checked:
+            checked.add(winner)
+            progress(done, work, f"the network of {winner} alone")
+            again = [
+                Job(
+                    _without(outcome.model, problem.model, sets[winner]),
+                    (),
+                    part,
+                    outcome.epochs,
+                    config.seed + part,
+                )
+                for part, outcome in enumerate(second[winner])
+            ]
+            outcomes = (
+                pool.map(_run_prepared, again) if pool else map(partial(run_job, split), again)
+            )
+            second[None] = _better_parts(split, second[None], list(outcomes))
+            scores = _scores(split, last, sets)
+            winner, competing, of_line, sure = _decided(split, _ahead(scores, best), last)
     shown = sorted(tried, key=lambda label: (label not in best, -scores[label].log_gain))
-    ahead = [scores[label] for label in shown if label in best]
-    winner, competing, of_line, sure = _decided(split, ahead, last)
     final = second or first
     return Refit(
         reason=reason,
@@ -575,7 +599,8 @@ def refit(
         unit=split.unit_name,
         units=len(np.unique(split.unit)),
         rows=split.rows,
-        trainings=sum(len(some) for found in (first, second) for some in found.values()),
+        trainings=sum(len(some) for found in (first, second) for some in found.values())
+        + config.seeds * len(checked),
         seconds=time.perf_counter() - begin,
     )
 
@@ -583,6 +608,28 @@ def refit(
 def _better(split: Split, *rungs: list[Outcome]) -> list[Outcome]:
     """The rung with the least held-out error: training on may overfit (early stopping)."""
     return min(rungs, key=lambda outcomes: float(_held_losses(split, outcomes).sum()))
+
+
+def _better_parts(split: Split, one: list[Outcome], other: list[Outcome]) -> list[Outcome]:
+    """Of two trainings for each part, the one with the least error on the part it left out."""
+
+    def error(outcome: Outcome, part: int) -> float:
+        return float(outcome.losses[split.part == part].sum())
+
+    pairs = enumerate(zip(one, other, strict=True))
+    return [min(pair, key=partial(error, part=part)) for part, pair in pairs]
+
+
+def _without(trained: ArmModel, given: ArmModel, effects: Iterable[str]) -> ArmModel:
+    """A trained model without the effects that the given one lacked."""
+    added = set(effects) - set(given.effects)
+    kept = {name: effect for name, effect in trained.effects.items() if name not in added}
+    return trained.replace(effects=kept)
+
+
+def _ahead(scores: dict[str, RefitCandidate], best: list[str]) -> list[RefitCandidate]:
+    """The candidates of the second rung, the best first."""
+    return sorted((scores[label] for label in best), key=lambda score: -score.log_gain)
 
 
 JOIN = " + "

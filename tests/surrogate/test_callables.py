@@ -331,3 +331,12 @@ def test_a_callable_is_not_written_as_a_graph(arc, tmp_path):
     assert not (tmp_path / "exported").exists()
     with pytest.raises(InputError, match="cannot be written as a graph"):
         torch.jit.trace(lambda p: model.network(p, p), torch.zeros(1, 3))
+
+
+def test_an_object_that_is_stepped_need_not_be_callable():
+    """Key points of an actuation alone, which opening a folder compares, are those of a hold."""
+    model = around(Steps())
+    pressure = torch.tensor([[20.0, 0.0, 5.0], [0.0, 30.0, 0.0]])
+    held = model.network(pressure, pressure, model.network.rest(pressure))
+    assert float((held[0] - held[1]).abs().max()) > 5.0
+    np.testing.assert_array_equal(model.network(pressure, pressure).numpy(), held.numpy())

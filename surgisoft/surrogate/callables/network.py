@@ -215,7 +215,14 @@ class CallableNetwork(nn.Module):
         return self._points(np.zeros(len(actuation)), actuation)
 
     def _alone(self, actuation: np.ndarray) -> np.ndarray:
-        """(S, n, 3) key points of rows (S, m), each a run of its own."""
+        """(S, n, 3) key points of rows (S, m), each held for a long time or a run of its own.
+
+        A callable that is stepped is never called itself: it need not be callable.
+        """
+        if self.form == "steps":
+            actuation = actuation.copy()
+            state = self._state(self._call("initial_state", actuation), len(actuation), None)
+            return self._step(state, actuation, np.zeros(len(actuation)))[1]
         return np.concatenate([self._points(np.zeros(1), row[None]) for row in actuation])
 
     def _runs(self, actuation: np.ndarray, history: History) -> np.ndarray:

@@ -47,7 +47,7 @@ def write_torch_script_of(
             given = {name: tuple(value) for name, value in methods.items()}
             traced = torch.jit.trace_module(module, given, check_trace=False)
         except Exception as error:
-            raise DoesNotTrace(_line(error)) from error
+            raise DoesNotTrace(reason_of(error)) from error
         # Written by Python: the library's own writer ends the process where the disk is full.
         content = io.BytesIO()
         torch.jit.save(traced, content)
@@ -94,7 +94,7 @@ def write_onnx(
         except ImportError:
             raise
         except Exception as error:
-            raise DoesNotTrace(_line(error)) from error
+            raise DoesNotTrace(reason_of(error)) from error
     file.write_bytes(content)
     from onnx.reference import ReferenceEvaluator
 
@@ -148,7 +148,7 @@ def _tuple(value) -> tuple[Tensor, ...]:
     return tuple(value) if isinstance(value, tuple | list) else (value,)
 
 
-def _line(error: Exception) -> str:
+def reason_of(error: Exception) -> str:
     """The first line of a message that says something, shortened.
 
     The message of an InputError, which tells what to do, is whole and without its class.

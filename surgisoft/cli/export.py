@@ -25,7 +25,8 @@ def export(
         Path,
         typer.Argument(
             metavar="RUN|MODEL",
-            help="Folder of a training run, or of an arm model; default: the arm of the package.",
+            help="Folder of a training run or of an arm model; default: the arm of the package; or "
+            "a Python callable that states its range: package.module:object, FILE.py:object.",
         ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="New folder.")],
@@ -51,18 +52,18 @@ def export(
     ] = None,
     effect_files: EffectFiles = None,
 ) -> None:
-    """Write a run's policies, or an arm model, as ONNX and TorchScript.
+    """Write a run's policies, or an arm model, as ONNX and TorchScript, or as NumPy code.
 
     A run gives, for each agent, its network, and one controller with observer, memories and
     predictions inside: measurements in, commands out. controller.py runs it without surgisoft,
     and policy.json states every name, order, unit and range. A model gives start(pressure) and
-    step(state, pressure, dt) -> state, key points, and arm.json.
+    step(state, pressure, dt) -> state, key points, and arm.json. A model that calls Python code
+    of yours (--model-code) becomes NumPy code that calls it: arm.py, or controller_code.py.
     """
-    from surgisoft.surrogate.callables.named import is_callable_name, no_graph
+    from surgisoft.surrogate.callables.named import is_callable_name
 
-    if is_callable_name(str(source)):
-        raise no_graph(str(source))
     is_model = str(source) == "default" or (source / "weights.safetensors").is_file()
+    is_model = is_model or is_callable_name(str(source))
     if is_model and (which is not None or check):
         raise InputError(f"{source}: is an arm model; --which and --check are for training runs")
     if data and not is_model:

@@ -5,7 +5,6 @@ from pathlib import Path
 from surgisoft.measurement.fitting import Recordings
 from surgisoft.measurement.histories import check_fits, history_of
 from surgisoft.measurement.recordings import load_recordings
-from surgisoft.surrogate.callables.named import is_callable_name, no_graph
 from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.export import export_arm as export_histories
 from surgisoft.surrogate.model import ArmModel
@@ -16,16 +15,16 @@ def export_arm(
 ) -> list[Path]:
     """Write an arm model as ONNX and TorchScript into a new folder; returns the files.
 
+    A model around a Python callable is written as one file of NumPy code that calls it, `arm.py`.
+
     The files map actuation in the model's unit to key points in mm in the arm base frame;
     `arm.json` states every name, order, unit and range. Raises InputError where the folder is in
-    use, where the model cannot be written as a graph, for recordings of another arm, and where a
-    file differs from the model by more than `surgisoft.surrogate.export.TOLERANCE_MM`.
+    use, where the model cannot be written, for recordings of another arm, and where a file differs
+    from the model by more than `surgisoft.surrogate.export.TOLERANCE_MM`.
 
-    model: a model or its folder. recordings: over whose rows files and model are compared too
-    (`surgisoft.surrogate.export.differences`).
+    model: a model, its folder, or the name of a callable that states its range. recordings: over
+    whose rows files and model are compared too (`surgisoft.surrogate.export.differences`).
     """
-    if isinstance(model, str | Path) and is_callable_name(str(model)):
-        raise no_graph(str(model))
     none = isinstance(recordings, list | tuple) and not recordings
     arm, measured = load_model(model), [] if none else load_recordings(recordings)
     check_fits(arm.spec, measured)

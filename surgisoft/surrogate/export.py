@@ -1,5 +1,7 @@
 """Arm models for other programs: TorchScript and ONNX with the state as one explicit vector.
 
+A model around a Python callable becomes a file of NumPy code with the same two functions.
+
     start(pressure) -> state
     step(state, pressure, dt) -> state, key points
 
@@ -12,11 +14,12 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -30,6 +33,13 @@ from surgisoft.graphs import (
     write_torch_script_of,
 )
 from surgisoft.surrogate.arm import ArmState
+from surgisoft.surrogate.callables.exported import (
+    arm_source,
+    described,
+    opened,
+    played,
+    run_of,
+)
 from surgisoft.surrogate.callables.network import CallableNetwork
 from surgisoft.surrogate.chain import STOOD_S, Signal, Standing, Stepping
 from surgisoft.surrogate.effects import EFFECTS, Context, Effect
@@ -46,7 +56,9 @@ CHECKED = 100
 ROOM_C = (15.0, 30.0)
 """Temperatures of the room in that recording, degrees Celsius."""
 FILES = ("arm.pt", "arm_start.onnx", "arm_step.onnx", "arm.json")
-"""What is written."""
+"""What is written of a model that is a graph."""
+CALLABLE_FILES = ("arm.py", "arm.json")
+"""What is written of a model around a Python callable."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +88,6 @@ class ArmGraph(nn.Module):
 
     def __init__(self, model: ArmModel):
         super().__init__()
-        if isinstance(model.network, CallableNetwork):
-            raise model.network.no_graph()
         self.model = copy.deepcopy(model).double().eval().requires_grad_(False)
         self.model.freeze()
         with torch.no_grad():
@@ -168,10 +178,11 @@ def export_arm(
 ) -> list[Path]:
     """Write an arm model for other programs; returns the files.
 
-    recordings: by their names; the files are also compared with the model over every row of each,
-    and `arm.json` has the largest difference of a coordinate in mm under `recordings`. Raises
-    InputError where the folder is in use, where an effect of the model cannot be written as a
-    graph, and where a difference is larger than `TOLERANCE_MM`.
+    A model around a Python callable becomes NumPy code that calls it (`arm.py`), any other one
+    TorchScript and ONNX. recordings: by their names; the files are also compared with the model
+    over every row of each, and `arm.json` has the largest difference of a coordinate in mm under
+    `recordings`. Raises InputError where the folder is in use, where an effect of the model cannot
+    be written, and where a difference is larger than `TOLERANCE_MM`.
     """
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -181,13 +192,15 @@ def export_arm(
         for name, effect in graph.model.effects.items():
             if kind_of(name) not in EFFECTS:
                 _check_effect(name, effect, graph)
+        called = isinstance(graph.model.network, CallableNetwork)
+        write, files = (_write_code, CALLABLE_FILES) if called else (_write, FILES)
         with new_folder(folder) as fresh:
-            worst, over = _write(graph, fresh, recordings or {})
+            worst, over = write(graph, fresh, recordings or {})
             about = describe_arm(graph, worst)
             write_json(fresh / "arm.json", about | ({"recordings": over} if over else {}))
     except DoesNotTrace as error:
         raise InputError(f"{folder}: the arm model cannot be exported: {error}") from error
-    return [folder / name for name in FILES]
+    return [folder / name for name in files]
 
 
 def differences(folder: str | Path) -> dict[str, dict[str, float]]:
@@ -209,7 +222,7 @@ def describe_arm(graph: ArmGraph, worst_mm: float) -> dict[str, Any]:
         "high": list(spec.high),
         "meaning": f"{spec.actuation} actuation of each chamber",
     }
-    tensors = {
+    tensors: dict[str, dict[str, Any]] = {
         "state": {"shape": ["B", size], "meaning": "memory of the arm, see `state`"},
         "pressure": actuation,
         "dt_s": {
@@ -234,18 +247,26 @@ def describe_arm(graph: ArmGraph, worst_mm: float) -> dict[str, Any]:
         {"name": part.name, "first": part.first, "last": part.last, "shape": list(part.shape)}
         for part in graph.parts
     ]
+    start: dict[str, Any] = {"inputs": ["pressure"], "outputs": ["state"]}
+    step: dict[str, Any] = {"inputs": graph.inputs, "outputs": ["next_state", "key_points_mm"]}
+    network = graph.model.network
+    if isinstance(network, CallableNetwork):
+        files = {"python": "arm.py", "model_code": described(network)}
+        if network.runs_only:
+            growing = "; behind it the times (s) and the effective actuation of the rows so far"
+            tensors["state"]["meaning"] += growing
+            tensors["next_state"]["meaning"] += growing
+    else:
+        files = {"torchscript": "arm.pt"}
+        start, step = {"onnx": "arm_start.onnx", **start}, {"onnx": "arm_step.onnx", **step}
     return {
         "format": FORMAT,
         "model": graph.model.summary(),
         "effects": list(graph.model.effects),
         "dtype": "float64",
-        "torchscript": "arm.pt",
-        "start": {"onnx": "arm_start.onnx", "inputs": ["pressure"], "outputs": ["state"]},
-        "step": {
-            "onnx": "arm_step.onnx",
-            "inputs": graph.inputs,
-            "outputs": ["next_state", "key_points_mm"],
-        },
+        **files,
+        "start": start,
+        "step": step,
         "start_meaning": "pressure (1, m) at which a run begins; an arm that begins away from rest "
         f"by more than {AWAY_SHARE:.0%} of a range is assumed to have been held there for "
         f"{STOOD_S:g} s, any other one to be at rest without a past",
@@ -300,11 +321,49 @@ def _write(
                 worst = max(worst, gap)
         return worst
 
+    return _over(graph, recordings, gap_of)
+
+
+def _over(
+    graph: ArmGraph, recordings: Mapping[str, History], gap_of: Callable[[History], float]
+) -> tuple[float, dict[str, dict[str, float]]]:
+    """What `_write` returns, from the largest difference over a history in mm."""
     over = {
         name: {"rows": int(history.valid.sum()), "largest_difference_mm": gap_of(history)}
         for name, history in recordings.items()
     }
     return gap_of(_recording(graph)), over
+
+
+def _write_code(
+    graph: ArmGraph, folder: Path, recordings: Mapping[str, History]
+) -> tuple[float, dict[str, dict[str, float]]]:
+    """Write `arm.py`, compared with the model; returns what `_write` does."""
+    network = cast(CallableNetwork, graph.model.network)
+    file = folder / "arm.py"
+    about = describe_arm(graph, 0.0)
+    del about["largest_difference_mm"]  # `arm.json` has it, after the comparison
+    file.write_text(arm_source(graph, _Start(graph), about), encoding="utf-8")
+    arm = opened(file)["Arm"](network.named.model)
+
+    def gap_of(history: History) -> float:
+        worst = 0.0
+        for run in _runs(history):
+            with torch.no_grad():
+                expected = graph.model.predict(run)[0].numpy()
+            stood = run.stood
+            first = None if stood is None or bool(stood.isnan().any()) else stood[0].numpy()
+            gap = float(np.abs(played(arm, network.name, first, run_of(run)) - expected).max())
+            if not gap <= TOLERANCE_MM:
+                later = "; key points of a run may not depend on its later rows" * network.runs_only
+                raise DoesNotTrace(
+                    f"arm.py differs by {gap:.2g} mm from the model; an effect that branches on "
+                    f"values cannot be exported{later}"
+                )
+            worst = max(worst, gap)
+        return worst
+
+    return _over(graph, recordings, gap_of)
 
 
 def _runs(history: History) -> Iterator[History]:

@@ -75,7 +75,8 @@ BAD = {
     "amend lab.csv --effect creep --data bench.parquet -o new": "cannot be amended",
     "next-experiment lab.csv -o new.csv": "predictions are given without recordings",
     "amend my_arm.py:arm --effect creep --data bench.parquet -o new --refit always": "no network",
-    "export my_arm.py:arm -o new": "'surgisoft fit REC -o MODEL') and export that, or call the ",
+    "export my_arm.py:arm -o new --check": "is an arm model; --which and --check are for training",
+    "export bad.py:flat -o new": "does not state its range",
     "train --task track_circle --arm bad.py:flat -o new": "does not state its range",
 }
 """Bad input, and what the one line says."""

@@ -13,7 +13,6 @@ from surgisoft.surrogate.callables.arm import arm_around, arm_by_itself
 from surgisoft.surrogate.callables.named import given_callable, is_callable_name, named_callable
 from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
 from surgisoft.surrogate.effects import Context, make_effect
-from surgisoft.surrogate.export import export_arm
 from surgisoft.surrogate.history import History, pack
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import ConstantCurvature
@@ -323,12 +322,9 @@ def test_an_object_without_a_name_cannot_be_saved(tmp_path):
     assert not (tmp_path / "saved").exists()
 
 
-def test_a_callable_is_not_written_as_a_graph(arc, tmp_path):
+def test_a_callable_is_not_traced_into_a_graph(arc):
     """A trace would keep the numbers of the callable and not its function."""
     model = around(Static(arc))
-    with pytest.raises(InputError, match="cannot be written as a graph"):
-        export_arm(model, tmp_path / "exported")
-    assert not (tmp_path / "exported").exists()
     with pytest.raises(InputError, match="cannot be written as a graph"):
         torch.jit.trace(lambda p: model.network(p, p), torch.zeros(1, 3))
 

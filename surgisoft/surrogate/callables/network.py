@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from surgisoft.errors import InputError
+from surgisoft.surrogate.callables import operators
 from surgisoft.surrogate.callables.named import (
     Named,
     checked_points,
@@ -70,6 +71,7 @@ class CallableNetwork(nn.Module):
         self.form: Form = form_of(self.named.model)
         self.step_size = DIFFERENCE * (high - low).where(high > low, torch.ones_like(low))
         self.cached: OrderedDict[bytes, np.ndarray] = OrderedDict()
+        self._states: int | None = None
 
     def __deepcopy__(self, memo: dict) -> "CallableNetwork":
         """A network of its own with the same callable, which is never changed."""
@@ -101,33 +103,71 @@ class CallableNetwork(nn.Module):
     def forward(self, pressure: Tensor, direction: Tensor, memory: Tensor | None = None) -> Tensor:
         """Key points (..., n, 3) in mm, base frame, from pressure (..., m).
 
-        memory: (..., k + 3 n) of a callable that is stepped. One of whole runs takes each row as a
-        run of its own, of one row.
+        memory: (..., k + 3 n) of a callable that is stepped; None: held at the pressure for a long
+        time. One of whole runs takes each row as a run of its own, of one row.
         """
-        if self.form == "static":
-            return self._differentiable(self._static, pressure)
-        if memory is not None:
+        if self.form != "static" and memory is not None:
             points = memory[..., memory.shape[-1] - 3 * self.key_points :]
             return points.unflatten(-1, (self.key_points, 3)).to(pressure.dtype)
-        return self._differentiable(self._alone, pressure)
+        if operators.operated():
+            place = operators.number_of(self)
+            rows = pressure.double().reshape(-1, pressure.shape[-1])
+            points = torch.ops.surgisoft.callable_points(rows, place, self.key_points)
+            return points.reshape(*pressure.shape[:-1], self.key_points, 3).to(pressure.dtype)
+        return self._differentiable(self.points_of_rows, pressure)
+
+    def points_of_rows(self, actuation: np.ndarray) -> np.ndarray:
+        """(S, n, 3) key points in mm of rows (S, m), each held for a long time or a run of its own.
+
+        A callable that is stepped is never called itself: it need not be callable.
+        """
+        if self.form == "steps":
+            return self.step_of(self.state_of(actuation), actuation, np.zeros(len(actuation)))[1]
+        return self._static(actuation) if self.form == "static" else self._alone(actuation)
 
     def rest(self, pressure: Tensor) -> Tensor:
         """(B, k + 3 n) memory of arms that begin at pressure (B, m): state, then key points."""
+        if operators.operated():
+            place, size = operators.number_of(self), self.states
+            state = torch.ops.surgisoft.callable_state(pressure.double(), place, size)
+            return self._operated(state, pressure, pressure.new_zeros(len(pressure)))
         actuation = _numbers(pressure)
+        return self._stepped(self.state_of(actuation), pressure, np.zeros(len(actuation)))
+
+    @property
+    def states(self) -> int:
+        """k, how many numbers the state of a callable has that is stepped."""
+        if self._states is None:
+            self.state_of(np.zeros((1, len(self.step_size))))
+        assert self._states is not None
+        return self._states
+
+    def state_of(self, actuation: np.ndarray) -> np.ndarray:
+        """(B, k) state of a callable that was held at actuation (B, m)."""
         state = self._state(self._call("initial_state", actuation), len(actuation), None)
-        return self._stepped(state, pressure, np.zeros(len(actuation)))
+        self._states = state.shape[1]
+        return state
 
     def advance(self, memory: Tensor, pressure: Tensor, direction: Tensor, dt_s: Tensor) -> Tensor:
         """(B, k + 3 n) memory after pressure (B, m) was held for dt_s (B,) seconds."""
         states = memory.shape[1] - 3 * self.key_points
+        if operators.operated():
+            return self._operated(memory[:, :states], pressure, dt_s)
         return self._stepped(_numbers(memory[:, :states]), pressure, _numbers(dt_s))
+
+    def _operated(self, state: Tensor, pressure: Tensor, dt_s: Tensor) -> Tensor:
+        """(B, k + 3 n) state and key points after a step that stays a call in a traced program."""
+        place = operators.number_of(self)
+        given = (state.double(), pressure.double(), dt_s.double())
+        fresh, points = torch.ops.surgisoft.callable_step(*given, place, self.key_points)
+        return torch.cat([fresh, points.flatten(1)], 1)
 
     def _stepped(self, before: np.ndarray, pressure: Tensor, dt_s: np.ndarray) -> Tensor:
         """(B, k + 3 n) state and key points after a step from states (B, k)."""
 
         def evaluate(actuation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             copies = len(actuation) // len(before)
-            return self._step(np.tile(before, (copies, 1)), actuation, np.tile(dt_s, copies))
+            return self.step_of(np.tile(before, (copies, 1)), actuation, np.tile(dt_s, copies))
 
         state, known = evaluate(_numbers(pressure))
         points = self._differentiable(lambda moved: evaluate(moved)[1], pressure, known)
@@ -150,7 +190,7 @@ class CallableNetwork(nn.Module):
         moved, dt_s = _numbers(actuation), _numbers(history.dt_s)
         points = np.empty((*moved.shape[:2], self.key_points, 3))
         for row in range(moved.shape[1]):
-            state, points[:, row] = self._step(state, moved[:, row], dt_s[:, row])
+            state, points[:, row] = self.step_of(state, moved[:, row], dt_s[:, row])
         return torch.from_numpy(points).to(actuation)
 
     def slope_along(
@@ -198,7 +238,7 @@ class CallableNetwork(nn.Module):
         away = actuation - actuation.detach()
         return value + torch.einsum("...njm,...m->...nj", slope.view(*shape, len(step)), away)
 
-    def _step(
+    def step_of(
         self, state: np.ndarray, actuation: np.ndarray, dt_s: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """State (B, k) and key points (B, n, 3) after actuation (B, m) was held for dt_s (B,)."""
@@ -215,14 +255,7 @@ class CallableNetwork(nn.Module):
         return self._points(np.zeros(len(actuation)), actuation)
 
     def _alone(self, actuation: np.ndarray) -> np.ndarray:
-        """(S, n, 3) key points of rows (S, m), each held for a long time or a run of its own.
-
-        A callable that is stepped is never called itself: it need not be callable.
-        """
-        if self.form == "steps":
-            actuation = actuation.copy()
-            state = self._state(self._call("initial_state", actuation), len(actuation), None)
-            return self._step(state, actuation, np.zeros(len(actuation)))[1]
+        """(S, n, 3) key points of rows (S, m), each a run of its own."""
         return np.concatenate([self._points(np.zeros(1), row[None]) for row in actuation])
 
     def _runs(self, actuation: np.ndarray, history: History) -> np.ndarray:

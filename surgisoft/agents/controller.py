@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from surgisoft.agents.observer import Observer, ObserverGains, Order
 from surgisoft.errors import InputError
+from surgisoft.surrogate.callables.network import CallableNetwork
 from surgisoft.tasks.base import FEED_SIGNAL, Episodes, MeasuredTask, Signal, Task, TaskState
 from surgisoft.tasks.describe import field_docs
 from surgisoft.tasks.world.adaptation import Adaptation
@@ -224,6 +225,12 @@ class ControllerGraph(nn.Module):
             joint = torch.cat([seen[agent] for agent in moved.agents], 1)
         self.widths = {agent: seen[agent].shape[1] for agent in moved.agents}
         self.register_buffer("initial", self.packed(self.start, joint))
+
+    @property
+    def callables(self) -> list[CallableNetwork]:
+        """The arms' models that call Python code of the user, which no graph can have."""
+        networks = [arm.model.network for arm in self.arms.values()]
+        return [each for each in networks if isinstance(each, CallableNetwork)]
 
     @property
     def inputs(self) -> list[str]:

@@ -1,7 +1,9 @@
 """Run an exported controller: measurements in, commands out. This file needs no other package.
 
 `surgisoft export RUN -o DIR` writes this file as `controller.py` beside `controller.onnx`,
-`controller.pt` and `policy.json`. It needs NumPy, and onnxruntime, or torch, or onnx.
+`controller.pt` and `policy.json`. It needs NumPy, and onnxruntime, or torch, or onnx. Where an arm
+model calls Python code of yours, `controller_code.py` lies there in place of the graphs; it needs
+NumPy and that code alone, and is imported.
 
     from controller import Controller
 
@@ -23,6 +25,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +40,11 @@ class Controller:
     """One robot's controller: keeps the state between samples and checks what comes in."""
 
     def __init__(self, folder: str | Path, engine: str | None = None):
-        """Open an exported policy; engine: `onnxruntime`, `torch` or `onnx`, None: the first."""
+        """Open an exported policy.
+
+        engine: `onnxruntime`, `torch` or `onnx`; None: the first that is installed. A policy whose
+        arm model calls Python code has none of these, and imports that code.
+        """
         folder = Path(folder)
         about = json.loads((folder / "policy.json").read_text(encoding="utf-8"))
         if about.get("controller") is None:
@@ -207,6 +214,8 @@ class Controller:
 def _function(folder: Path, about: dict, engine: str | None) -> Function:
     """The controller's function by the first engine that is installed."""
     engines = {"onnxruntime": _onnxruntime, "torch": _torch, "onnx": _onnx}
+    if "python" in about:
+        engines = {"numpy": _numpy}
     if engine is not None and engine not in engines:
         raise ValueError(f"engine '{engine}' is not known, expected {', '.join(engines)}")
     for name in [engine] if engine else engines:
@@ -215,6 +224,15 @@ def _function(folder: Path, about: dict, engine: str | None) -> Function:
         except ImportError:
             continue
     raise ImportError(f"install one of {', '.join(engines)} (asked for: {engine or 'any'})")
+
+
+def _numpy(folder: Path, about: dict) -> Function:
+    spec = spec_from_file_location("controller_code", folder / "controller_code.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.opened()
 
 
 def _onnxruntime(folder: Path, about: dict) -> Function:

@@ -5,7 +5,8 @@ gives it in, `action` (B, m) float32 out, change of pressure in kPa within the p
 
 `controller.onnx` and `controller.pt` are all of it, from measurements to commands, for one robot:
 see `ControllerGraph`. `controller.py` runs either without this package, and `policy.json` states
-every name, order, unit, scale and range.
+every name, order, unit, scale and range. Where an arm model calls Python code of the user, which no
+graph can have, `controller_code.py` is in their place: NumPy code that calls it.
 """
 
 from __future__ import annotations
@@ -15,10 +16,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from surgisoft.agents import controller_runner
+from surgisoft.agents import controller_code, controller_runner
 from surgisoft.agents.actor import ScaledActor
 from surgisoft.agents.controller import ControllerGraph, goal_docs
 from surgisoft.agents.controller_runner import Controller
@@ -26,17 +28,28 @@ from surgisoft.agents.learned import LearnedPolicy
 from surgisoft.agents.observer import ObserverGains
 from surgisoft.errors import InputError
 from surgisoft.files import json_safe, new_folder, write_json
-from surgisoft.graphs import DoesNotTrace, largest_difference, write_onnx, write_torch_script
+from surgisoft.graphs import (
+    Call,
+    DoesNotTrace,
+    largest_difference,
+    write_onnx,
+    write_torch_script,
+)
+from surgisoft.surrogate.callables.exported import described, file_text, functions, opened
 from surgisoft.tasks.base import DocumentedTask, Task
 from surgisoft.tasks.describe import describe_agents
 
+CODE = "controller_code.py"
+"""File of a controller whose arm model calls Python code."""
 FORMAT = 2
 """Version of `policy.json`; version 1 had the networks alone."""
 TOLERANCE = 1e-5
 """Largest accepted difference between actions of exported and original policy, kPa."""
 CONTROLLER_TOLERANCE = 1e-4
 """Largest accepted difference of any command (kPa), estimate (mm) or observation of an exported
-controller over CHECKED samples."""
+controller over CHECKED samples; of an observation also what rounding alone makes of it."""
+ROUNDING = 6e-8
+"""Relative size of the rounding of a number in single precision."""
 CHECKED = 40
 """Samples of a random sequence on which an exported controller is compared."""
 SETTABLE = {
@@ -81,16 +94,15 @@ def export(
         }
         try:
             graph = ControllerGraph(task, policy.actors, gains).eval().requires_grad_(False)
-            _controller(graph, fresh)
-            written += [fresh / "controller.onnx", fresh / "controller.pt"]
+            written += (_controller_code if graph.callables else _controller)(graph, fresh)
             content |= describe_controller(graph)
             runner = Path(controller_runner.__file__).read_text(encoding="utf-8")
             (fresh / "controller.py").write_text(runner, encoding="utf-8")
             written.append(fresh / "controller.py")
         except (DoesNotTrace, InputError) as error:
             content |= {"controller": None, "note": str(error)}
-            for file in fresh.glob("controller.*"):  # the one of the two that was written
-                file.unlink()
+            for file in [*fresh.glob("controller.*"), fresh / CODE]:  # what was written of it
+                file.unlink(missing_ok=True)
         write_json(fresh / "policy.json", content)
         names = [*(file.name for file in written), "policy.json"]
     return [folder / name for name in names]
@@ -151,7 +163,10 @@ def describe_controller(graph: ControllerGraph) -> dict[str, Any]:
         for suffix, meaning in SETTABLE.items()
         if leaf["name"].startswith("arms.") and leaf["name"].split(".", 2)[2] == suffix
     ]
-    described = describe_agents(cast(DocumentedTask, graph.simulated))
+    agents = describe_agents(cast(DocumentedTask, graph.simulated))
+    files: dict[str, Any] = {"onnx": "controller.onnx", "torchscript": "controller.pt"}
+    if graph.callables:
+        files = {"python": CODE, "model_code": [described(each) for each in graph.callables]}
     signals = [
         {
             "name": signal.name,
@@ -181,12 +196,11 @@ def describe_controller(graph: ControllerGraph) -> dict[str, Any]:
                 }
                 for block in facts.observation
             ]
-            for agent, facts in described.items()
+            for agent, facts in agents.items()
         },
         "observations_note": NOTE,
         "controller": {
-            "onnx": "controller.onnx",
-            "torchscript": "controller.pt",
+            **files,
             "runner": "controller.py",
             "control_period_s": graph.control_s,
             "arms": arms,
@@ -243,7 +257,69 @@ def _shaped(values: list[float], leaf: dict) -> Any:
     return flat.reshape(leaf["shape"]).tolist()
 
 
-def _controller(graph: ControllerGraph, folder: Path) -> None:
+def _controller_code(graph: ControllerGraph, folder: Path) -> list[Path]:
+    """Write `controller_code.py`, checked on a sequence of samples; returns the files."""
+    parts = {"_controller": (graph, graph.example(), graph.inputs, False)}
+    code, called = functions(parts)
+    about = {"inputs": graph.inputs, "model_code": [described(each) for each in called]}
+    file = folder / CODE
+    runner = Path(controller_code.__file__)
+    text = file_text(runner, code, about, {"controller": "_controller"})
+    file.write_text(text, encoding="utf-8")
+    function = opened(file)["opened"]([each.named.model for each in called])
+
+    def other(*given: Tensor) -> tuple[Tensor, ...]:
+        values = {name: value.numpy() for name, value in zip(graph.inputs, given, strict=True)}
+        return tuple(torch.from_numpy(np.array(value)) for value in function(values))
+
+    _compared(graph, other, CODE)
+    return [file]
+
+
+def _compared(graph: ControllerGraph, other: Call, name: str) -> None:
+    """Raise DoesNotTrace unless a file's function agrees with the graph over samples.
+
+    An observation may be ill-conditioned, such as the direction of an error that is nearly none:
+    it may differ by as much as it does from itself where the state is moved by its rounding.
+    """
+    worst = _largest(graph, graph, other)
+    if worst <= CONTROLLER_TOLERANCE:
+        return
+    noise = torch.Generator().manual_seed(1)
+
+    def moved(state: Tensor, *given: Tensor) -> tuple[Tensor, ...]:
+        rounding = 1.0 + ROUNDING * torch.randn(state.shape, generator=noise)
+        return graph(state * rounding, *given)
+
+    acted, seen = (_some(graph, graph, observations) for observations in (False, True))
+    same = _largest(graph, acted, _some(graph, other, False)) <= CONTROLLER_TOLERANCE
+    if not (same and worst <= _largest(graph, seen, _some(graph, moved, True))):
+        raise DoesNotTrace(
+            f"controller: {name} differs by {worst:.2g} from the policy; an effect or a task "
+            "that branches on values cannot be exported"
+        )
+
+
+def _largest(graph: ControllerGraph, one: Call, other: Call) -> float:
+    """Largest difference of two functions of a graph's inputs over samples."""
+    # The state has coefficients in units of their prior deviations, which noise alone decides
+    # where the motion shows little of them; what they do is in the estimates.
+    return largest_difference(one, other, _samples(graph), states=1, compared_states=False)
+
+
+def _some(graph: ControllerGraph, function: Call, observations: bool) -> Call:
+    """A function of a graph's inputs that returns the state, and the observations or the rest."""
+    names = graph.outputs
+    kept = [name.endswith("_observation") == observations for name in names[1:]]
+
+    def call(*given: Tensor) -> tuple[Tensor, ...]:
+        state, *found = function(*given)
+        return state, *(value for value, keep in zip(found, kept, strict=True) if keep)
+
+    return call
+
+
+def _controller(graph: ControllerGraph, folder: Path) -> list[Path]:
     """Write `controller.pt` and `controller.onnx`, each checked on a sequence of samples."""
     example = graph.example()
     files = {
@@ -253,16 +329,8 @@ def _controller(graph: ControllerGraph, folder: Path) -> None:
         ),
     }
     for name, write in files.items():
-        # The state has coefficients in units of their prior deviations, which noise alone decides
-        # where the motion shows little of them; what they do is in the estimates.
-        worst = largest_difference(
-            graph, write(folder / name), _samples(graph), states=1, compared_states=False
-        )
-        if not worst <= CONTROLLER_TOLERANCE:
-            raise DoesNotTrace(
-                f"controller: {name} differs by {worst:.2g} from the policy; an effect or a task "
-                "that branches on values cannot be exported"
-            )
+        _compared(graph, write(folder / name), name)
+    return [folder / name for name in files]
 
 
 def _samples(graph: ControllerGraph) -> Iterator[list[Tensor]]:

@@ -230,7 +230,8 @@ class _Writer:
         self.arguments = list(inputs)
 
     def function(self, name: str, first: str) -> str:
-        lines = []
+        """Source code of the function."""
+        lines: list[tuple[Any, str]] = []
         results: Sequence[Any] = ()
         for node in self.graph.nodes:
             if node.op == "output":
@@ -302,7 +303,7 @@ class _Writer:
             return f"np.{_kind(given)}"
         return repr(given)
 
-    def _cast(self, given: Any, kind: torch.dtype) -> str:
+    def _cast(self, given: Any, kind: torch.dtype | None) -> str:
         """An argument in the type of the result, where NumPy's would be another."""
         text = self._value(given)
         own = _type_of(given)

@@ -36,7 +36,8 @@ def log_arm(columns: Columns, name: str, arm: ArmLog, rows: np.ndarray) -> None:
     _log_tip(columns, f"/arms/{name}/tip", rows, tip, aim, radius, colour)
     middles, axes = key_planes(arm.points_mm[rows], body)
     # The bands at the ends stay short of them, so that each face is drawn by one body only.
-    middles[:, 0] += 0.7 * BAND_MM * axes[:, 0]
+    if middles.shape[1] > 1:
+        middles[:, 0] += 0.7 * BAND_MM * axes[:, 0]
     middles[:, -1] -= 1.5 * BAND_MM * axes[:, -1]
     _log_bands(columns, f"/arms/{name}/key_points", rows, middles, axes, 1.03 * radius, band)
     if not np.array_equal(arm.seen_mm, arm.points_mm):

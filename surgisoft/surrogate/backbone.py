@@ -175,12 +175,13 @@ def require_body(spec: ArmSpec, rest_mm: Tensor, label: str) -> None:
     """
     if spec.key_points != 1:
         return
-    reason = None
+    reason, advice = None, "correct the frame of the recordings (origin at the base, z along it)"
     x, y, z = (float(value) for value in rest_mm[-1])
     lean = math.atan2(math.hypot(x, y), z)
     length = math.hypot(x, y, z) * (lean / math.sin(lean) if lean > STRAIGHT_RAD else 1.0)
     if spec.chambers > MOST_CHAMBERS:
         reason = f"has {spec.chambers} chambers, several segments with one key point in all"
+        advice = "measure at least the end of each segment"
     elif not lean <= MOST_LEAN_RAD:
         reason = (
             f"has its only key point {math.degrees(lean):.0f} degrees from the z axis at rest, "
@@ -193,7 +194,6 @@ def require_body(spec: ArmSpec, rest_mm: Tensor, label: str) -> None:
         )
     if reason is not None:
         raise InputError(
-            f"{label} {reason}: its body does not follow from its tip. Measure more key points or "
-            "correct the frame of the recordings (origin at the base, z along the arm); "
-            f"{', '.join(TIP_TASKS[:-1])} and {TIP_TASKS[-1]} take it as it is"
+            f"{label} {reason}: its body does not follow from its tip; {advice}, or take a task "
+            f"of the tip: {', '.join(TIP_TASKS[:-1])} or {TIP_TASKS[-1]}"
         )

@@ -146,7 +146,9 @@ def test_an_arc_is_refused_where_it_is_not_the_body(chambers, length_mm, bend, m
     if message is None:
         require_body(spec, tip_at(bend), "arm 'a'")
         return
-    with pytest.raises(InputError, match=f"^arm 'a' {message}.*track_body take it as it is$"):
+    with pytest.raises(
+        InputError, match=f"^arm 'a' {message}.* does not follow from its tip; .*or track_body$"
+    ):
         require_body(spec, tip_at(bend), "arm 'a'")
     many = ArmSpec(chambers, 2, spec.low, spec.high, length_mm=length_mm)
     require_body(many, torch.cat((torch.zeros(1, 3), tip_at(bend))), "arm 'a'")

@@ -1,9 +1,11 @@
 """Centrelines that a fitted arm can reach, as plain arrays for geometric planning."""
 
+import warnings
+
 import numpy as np
 import torch
 
-from surgisoft.errors import InputError
+from surgisoft.errors import AssumptionWarning, InputError
 from surgisoft.surrogate.model import ArmModel
 
 COUNTS = {1: 41, 2: 41, 3: 15, 4: 8, 5: 6, 6: 5}
@@ -17,10 +19,18 @@ def model_table(
 
     Returns the grid's axes in the arm's unit; centrelines (N, points, 3) in mm and tip directions
     (N, 3), unit, both in the base frame, the last axis running fastest. Raises InputError for an
-    arm of more than six chambers.
+    arm of more than six chambers, and for one whose body does not follow from its tip. Warns
+    (`AssumptionWarning`) where only the tip was measured.
     """
     spec = model.spec
     model.require_body("the arm")
+    if spec.key_points == 1:
+        warnings.warn(
+            "only the tip of an arm was measured; its reach is that of an arc of constant "
+            "curvature from the base to the tip, which no data check",
+            AssumptionWarning,
+            stacklevel=2,
+        )
     if spec.chambers not in COUNTS:
         raise InputError(
             f"an arm of {spec.chambers} chambers needs too large a table; expected at "

@@ -6,6 +6,7 @@ The body is compared with a circle that is tangent to the base's axis and goes t
 import math
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -26,6 +27,7 @@ from surgisoft.surrogate.backbone import TIP_TASKS
 from surgisoft.surrogate.checkpoint import default_arm, save_model
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import HawNN
+from surgisoft.surrogate.reach import model_table
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.inverse_kinematics import Pointing
 from surgisoft.tasks.lone_ring import LoneRing
@@ -202,6 +204,20 @@ def test_the_exact_checker_meets_the_arc(folders):
         hit = checker.cast(*tips["laser"], 110.0, shapes, own="laser")
         assert int(hit.struck) == scene.hit.struck[i].item()
         np.testing.assert_allclose(hit.point_mm, scene.hit.point_mm[i].numpy(), atol=1e-3)
+
+
+def test_mounts_are_searched_for_an_arm_that_is_an_arc():
+    """The reach table holds circles, says what it assumes, and refuses an arm of two segments."""
+    with pytest.warns(AssumptionWarning, match="its reach is that of an arc of constant curvature"):
+        _, lines, aims = model_table(tip_arm(), points=9)
+    some = slice(0, None, 1000)
+    lines, aims = (torch.tensor(values[some]) for values in (lines, aims))
+    part = SimpleNamespace(points_mm=lines[:, -1:], mount=torch.eye(4).repeat(len(lines), 1, 1))
+    line, aim = around(part, torch.linspace(0.0, 1.0, 9))
+    torch.testing.assert_close(lines, line, rtol=0, atol=AGREE_MM)
+    torch.testing.assert_close(aims, aim, rtol=0, atol=4e-6)
+    with pytest.raises(InputError, match="the arm has 6 chambers, several segments"):
+        model_table(arc_arm(6))
 
 
 @every_task

@@ -10,10 +10,15 @@ import torch
 from surgisoft.errors import InputError
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import CollisionChecker
+from surgisoft.surrogate.arm import ArmSpec
+from surgisoft.surrogate.checkpoint import save_model
+from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.networks import ConstantCurvature
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.inverse_kinematics import action_towards
 from surgisoft.tasks.keyhole import Keyhole, KeyholeConfig
 from surgisoft.tasks.trajectories.waypoints import point_at, progress
+from surgisoft.tasks.world.arm import ModelArm
 
 
 @pytest.fixture(scope="module")
@@ -137,3 +142,27 @@ def test_progress_along_a_bend_by_hand():
 def test_what_cannot_be_is_one_line(config, says):
     with pytest.raises(InputError, match=says):
         Keyhole(KeyholeConfig(**config))
+
+
+def test_an_arm_with_six_chambers_is_searched_for_targets_on_a_coarser_grid(tmp_path, monkeypatch):
+    """Two segments of three chambers; 14 pressures of each chamber would be 7.5 million shapes."""
+    low, high, angle = torch.zeros(6), torch.full((6,), 60.0), torch.arange(3) * 2.0 * math.pi / 3.0
+    rest = torch.tensor([[0.0, 0.0, 17.5 * k] for k in range(5)])
+    network = ConstantCurvature(low, high, key_points=5)
+    network.set_rest(rest)
+    push = 0.3 * torch.stack((angle.cos(), angle.sin()))
+    network.table.data[0, :2, :3], network.table.data[1, :2, 3:6] = push, push
+    spec = ArmSpec(6, 5, tuple(low.tolist()), tuple(high.tolist()), length_mm=70.0)
+    save_model(ArmModel(spec, network, rest_mm=rest).requires_grad_(False), tmp_path / "arm")
+    asked, settled = [], ModelArm.settled
+
+    def counted(arm, pressure):
+        asked.append(len(pressure))
+        return settled(arm, pressure)
+
+    monkeypatch.setattr(ModelArm, "settled", counted)
+    found = Keyhole(KeyholeConfig(arm=str(tmp_path / "arm")))
+    assert 5**6 in asked
+    assert max(asked) <= 9 * 5**6
+    slots = found.routes.first.diff()
+    assert (slots > 0).all()

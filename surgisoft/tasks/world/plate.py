@@ -17,7 +17,9 @@ from surgisoft.tasks.world.scene import ObstacleEngine
 from surgisoft.tasks.world.world import World, WorldConfig, named_arm, single_arm_world
 
 GRID = 14
-"""Pressures of each chamber in the grid search for targets."""
+"""Pressures of each chamber in the grid search for targets, of up to four chambers."""
+MOST_SHAPES = 40_000
+"""Most shapes of that grid: arms with more chambers have fewer pressures of each."""
 EDGE = 0.05
 """Margin at either end of a chamber's range that targets leave for hysteresis, as a share of it."""
 ROUTE_POINTS = 9
@@ -76,7 +78,8 @@ def clear_routes(
     arm = world.arms["arm"]
     room = EDGE * (arm.high - arm.low)
     bounds = zip(arm.low + room, arm.high - room, strict=True)
-    ends = [torch.linspace(low, high, GRID) for low, high in bounds]
+    count = min(GRID, int(MOST_SHAPES ** (1.0 / arm.chambers)))
+    ends = [torch.linspace(low, high, count) for low, high in bounds]
     pressure = torch.cartesian_prod(*ends).to(world.device).reshape(-1, arm.chambers)
     home = arm.settled(arm.first[None])[0, -1]
     aside = (arm.settled(pressure)[:, -1] - home)[:, :2]

@@ -11,7 +11,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import sys
-import warnings
 from collections.abc import Mapping
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -20,8 +19,7 @@ from typing import Any
 import torch
 
 from surgisoft.config import Where, from_table, merged, read_toml, to_table
-from surgisoft.errors import AssumptionWarning, InputError, unknown_name
-from surgisoft.surrogate.backbone import TIP_TASKS
+from surgisoft.errors import InputError, unknown_name
 from surgisoft.tasks.area_ablation import AREA_ABLATION
 from surgisoft.tasks.arguments import check_path, device_of, whole
 from surgisoft.tasks.base import DocumentedTask, Task
@@ -35,6 +33,7 @@ from surgisoft.tasks.spec import TaskSpec
 from surgisoft.tasks.track import TRACK_CIRCLE, TRACK_SQUARE
 from surgisoft.tasks.track_body import TRACK_BODY
 from surgisoft.tasks.two_laser_ring import TWO_LASER_RING
+from surgisoft.tasks.world.world import say_assumed
 
 TASKS: dict[str, TaskSpec] = {
     "track_circle": TRACK_CIRCLE,
@@ -134,21 +133,8 @@ def make_task(name: str, config: Any = None, device: str | torch.device = "cpu")
             f"{name}: an episode of no step; expected longer times or a shorter dt_s in its "
             "configuration"
         )
-    _say_assumed(task)
+    say_assumed(task.name, task.world.arms)
     return task
-
-
-def _say_assumed(task: DocumentedTask) -> None:
-    """Warn where the body of an arm in a task is an assumption."""
-    arcs = [name for name, arm in task.world.arms.items() if arm.key_points == 1]
-    if arcs and task.name not in TIP_TASKS:
-        named = " and ".join(f"'{name}'" for name in arcs)
-        warnings.warn(
-            f"{task.name}: only the tip of arm {named} was measured; body and tip axis are those "
-            "of an arc of constant curvature from the base to the tip, which no data check",
-            AssumptionWarning,
-            stacklevel=3,
-        )
 
 
 def _check_counts(name: str, config: Any, place: str = "") -> None:

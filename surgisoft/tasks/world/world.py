@@ -7,6 +7,7 @@ and a batch of N environments gives what N batches of one give. World frame, mm,
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,9 +17,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surgisoft.errors import InputError
+from surgisoft.errors import AssumptionWarning, InputError
 from surgisoft.scene.folder import Scene, open_scene
 from surgisoft.scene.spec import MountSpec
+from surgisoft.surrogate.backbone import TIP_TASKS
 from surgisoft.surrogate.checkpoint import default_arm, load_model
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.tasks.world.arm import (
@@ -303,6 +305,19 @@ def _not_finite(parts: Mapping[str, ArmPart]) -> Tensor:
 
 def _without_dose(state: WorldState) -> WorldState:
     return replace(state, scene=replace(state.scene, dose=None))
+
+
+def say_assumed(task: str, arms: Mapping[str, Arm]) -> None:
+    """Warn the caller of the caller where the body of an arm in the named task is an assumption."""
+    arcs = [name for name, arm in arms.items() if arm.key_points == 1]
+    if arcs and task not in TIP_TASKS:
+        named = " and ".join(f"'{name}'" for name in arcs)
+        warnings.warn(
+            f"{task}: only the tip of arm {named} was measured; body and tip axis are those "
+            "of an arc of constant curvature from the base to the tip, which no data check",
+            AssumptionWarning,
+            stacklevel=3,
+        )
 
 
 def single_arm_world(

@@ -29,6 +29,7 @@ from surgisoft.progress import Progress, silent
 from surgisoft.scene.folder import Scene, open_scene
 from surgisoft.tasks.base import Episodes, Task
 from surgisoft.tasks.episodes.log import EpisodeLog
+from surgisoft.tasks.path_following import REACHED_MM, Follow
 from surgisoft.tasks.registry import (
     config_of,
     make_task,
@@ -277,10 +278,26 @@ def evaluate(
     names = tuple(dict.fromkeys(str(name) for name in given))
     request = EvaluationRequest(names, task, **fields).under_rules()
     plain, config = request.resolved(on_warning)
+    _warn_of_reach(plain, on_warning)
     place = plain if request.rig is None else on_rig(plain, request.rig, on_warning=on_warning)
     if request.rules is not None:
         plain, place = request.rules.over(plain), request.rules.over(place)
     return _evaluated(request, plain, place, config, progress)
+
+
+def _warn_of_reach(task: Task, on_warning: Callable[[str], None]) -> None:
+    """Warn of a path that leaves the arm's reach: no policy can follow it there."""
+    if not isinstance(task, Follow):
+        return
+    off = task.out_of_reach_mm()
+    beyond = off > REACHED_MM
+    if beyond.any():
+        on_warning(
+            f"{100 * float(beyond.float().mean()):.0f} % of the path of {task.name} is out of the "
+            f"arm's reach, by up to {float(off.max()):.2f} mm (mean over the path "
+            f"{float(off.mean()):.2f} mm): no policy comes nearer; make the path smaller (size_mm) "
+            "or move its centre (docs/evaluate.md)"
+        )
 
 
 def _warm_up(task: Task, policy: Policy) -> None:

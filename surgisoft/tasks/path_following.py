@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.surrogate.reach import model_table
 from surgisoft.tasks.base import TaskState, check_weights, weighted
-from surgisoft.tasks.inverse_kinematics import action_towards
+from surgisoft.tasks.inverse_kinematics import action_towards, least_squares
 from surgisoft.tasks.observations import (
     Block,
     ObservationBlocks,
@@ -39,6 +40,11 @@ step, hence the small discount. Many minibatches, because the number of gradient
 final error."""
 FOLLOW_STEPS = 4_000_000
 """Environment steps of a training run of path following with the `fast` preset."""
+
+REACH_POINTS = 40
+"""Points of a path that are compared with the arm's reach (a count)."""
+REACHED_MM = 0.1
+"""Distance from which a point of a path counts as out of reach, mm: the scale of fine errors."""
 
 SHAPE = Block("shape", "measured key points relative to their rest positions", "mm", "x / 10")
 ERROR = Block("error", "target minus measured point", "mm", "asinh(x / 1 mm)")
@@ -207,6 +213,35 @@ class Follow:
         share = traversal.share(state.world.steps + ahead, self.approach, self.loop)
         flat = self.config.size_mm * PATHS[self.config.path](share)
         return self.centre + torch.nn.functional.pad(flat, (0, 1))
+
+    def out_of_reach_mm(self) -> Tensor:
+        """(K,) mm: distance of points along the path from the nearest that the arm reaches.
+
+        In steady states of the model without history, over the whole ranges of its chambers: the
+        nearest of a grid, then damped least squares. Raises InputError for an arm of more than six
+        chambers.
+        """
+        model = self.arm.model
+        share = torch.linspace(0.0, 1.0, REACH_POINTS + 1, device=self.centre.device)[:-1]
+        flat = self.config.size_mm * PATHS[self.config.path](share)
+        target = self.centre + torch.nn.functional.pad(flat, (0, 1))
+        axes, _, _ = model_table(model, 2)
+        grid = [torch.as_tensor(axis, dtype=target.dtype) for axis in axes]
+        tried = torch.cartesian_prod(*grid).reshape(-1, len(grid)).to(target.device)
+
+        def point(pressure: Tensor) -> Tensor:
+            state = model.initial_state(len(pressure), pressure)
+            return self.marker(model.step(state, torch.zeros_like(pressure), 1.0)[1])
+
+        with torch.inference_mode(False):
+            with torch.no_grad():
+                nearest = torch.cdist(target, point(tried)).argmin(1)
+            low, high = (edge.expand(len(target), -1) for edge in (tried.amin(0), tried.amax(0)))
+            best = least_squares(
+                lambda pressure: point(pressure) - target, tried[nearest], low, high, iterations=20
+            )
+            with torch.no_grad():
+                return (point(best) - target).norm(dim=1)
 
     def error_mm(self, state: TaskState[FollowGoal]) -> Tensor:
         """(B,) mm: distance of the true point from its target."""

@@ -39,15 +39,18 @@ def progress(title: str) -> Iterator[Progress]:
         TextColumn("{task.fields[pace]}"),
         TextColumn("{task.fields[note]}"),
     )
-    with RichProgress(*columns, console=console, transient=True, disable=not terminal) as bar:
-        task = bar.add_task(title, total=None, note="", pace="")
+    # Where there is no terminal, a disabled bar of rich 13 still ends with an empty line.
+    bar = RichProgress(*columns, console=console, transient=True) if terminal else None
+    with bar or contextlib.nullcontext():
+        task = bar.add_task(title, total=None, note="", pace="") if bar is not None else None
         last, paced = time.monotonic(), Pace()
 
         def report(done: float, total: float, note: str = "") -> None:
             nonlocal last
             pace = paced(done, total)
-            bar.update(task, completed=done, total=total, note=note, pace=pace)
-            if not terminal and time.monotonic() - last > LINE_EVERY_S:
+            if bar is not None and task is not None:
+                bar.update(task, completed=done, total=total, note=note, pace=pace)
+            elif time.monotonic() - last > LINE_EVERY_S:
                 last = time.monotonic()
                 share = f"{done / total:.0%}" if total else ""
                 parts = ", ".join(part for part in (share, note, pace) if part)

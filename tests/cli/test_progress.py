@@ -89,6 +89,14 @@ class Terminal(io.StringIO):
         return True
 
 
+def test_nothing_is_drawn_without_a_terminal(capsys, monkeypatch):
+    """The disabled bar of rich 13 ended with an empty line, as one that is stopped here does."""
+    monkeypatch.setattr("rich.progress.Progress.stop", lambda bar: print(file=sys.stderr))
+    with progress("fit") as report:
+        report(1.0, 2.0)
+    assert capsys.readouterr().err == ""
+
+
 def test_a_cell_of_a_notebook_gets_no_bar(monkeypatch):
     """IPython runs `!command` in a pseudo-terminal, whose every redrawn bar stays in the output."""
     shown = {}

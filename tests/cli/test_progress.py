@@ -91,7 +91,7 @@ class Terminal(io.StringIO):
 
 def test_nothing_is_drawn_without_a_terminal(capsys, monkeypatch):
     """The disabled bar of rich 13 ended with an empty line, as one that is stopped here does."""
-    monkeypatch.setattr("rich.progress.Progress.stop", lambda bar: print(file=sys.stderr))
+    monkeypatch.setattr("rich.progress.Progress.stop", lambda bar: sys.stderr.write("\n"))
     with progress("fit") as report:
         report(1.0, 2.0)
     assert capsys.readouterr().err == ""

@@ -8,6 +8,7 @@ import pytest
 from surgisoft.errors import InputError
 from surgisoft.measurement import tables
 from surgisoft.measurement.importing import import_files, load_map
+from surgisoft.measurement.importing.draft import draft_map
 from surgisoft.measurement.tables import read_text
 from tests.measurement.test_importing import BASE
 
@@ -184,6 +185,29 @@ def test_damaged_archive(tmp_path):
     map_path.write_text(GOOD)
     message = message_of(lambda: import_files([path], load_map(str(map_path)), "x"))
     assert str(path) in message
+
+
+def causes(error):
+    """The error and what it came from, as a traceback follows them, each once."""
+    chain = []
+    while error is not None and error not in chain:
+        chain.append(error)
+        error = error.__cause__ or error.__context__
+    return chain, error
+
+
+@pytest.mark.parametrize("name", ["raw.csv.gz", "raw.txt", "raw.trc"])
+def test_no_error_of_a_text_file_is_its_own_cause(tmp_path, name):
+    """Found by the fuzzer, which follows the causes of an error to their end."""
+    path, map_path = tmp_path / name, tmp_path / "map.toml"
+    path.write_bytes(gzip.compress(RAW.encode())[:-4] if name.endswith("gz") else b"no, numbers")
+    map_path.write_text(GOOD)
+    spec = load_map(str(map_path))
+    for read in (lambda: import_files([path], spec, "x"), lambda: draft_map(path)):
+        with pytest.raises(InputError) as told:
+            read()
+        chain, left = causes(told.value)
+        assert left is None, f"{chain[-1]} comes from itself"
 
 
 def test_number_beyond_the_last_column(tmp_path):

@@ -86,7 +86,10 @@ def draft_map(path: str | Path) -> str:
     try:
         layout = _layout(path) if chosen(path, FileRole()) is TEXT else _table_layout(path)
     except InputError as error:
-        raise no_text(path, error) from error
+        named = no_text(path, error)
+        if named is None:
+            raise
+        raise named from error
     names, label = layout.names, layout.label
     points = [*_key_points(names), *(_key_point_arrays(layout) if layout.paths else [])]
     if not points:

@@ -113,11 +113,11 @@ def _ending(path: Path) -> str:
     return path.suffix.lower().removeprefix(".")
 
 
-def no_text(path: Path, error: InputError) -> InputError:
-    """The error of a file that was read as text, with its kind where its ending tells it."""
+def no_text(path: Path, error: InputError) -> InputError | None:
+    """The error of a file that was read as text, with its kind; None where no ending tells it."""
     kind = NOT_READ.get(_ending(path))
     if kind is None:
-        return error
+        return None
     reason = str(error).removeprefix(f"{path}: ").partition(":")[0].partition(";")[0]
     return InputError(f"{path}: {kind}, for which there is no reader; {ADVICE} (as text: {reason})")
 
@@ -136,9 +136,11 @@ def open_raw(path: Path, role: FileRole) -> RawTable:
     try:
         return found.read(path, role)
     except InputError as error:
-        if found is text.READER and role.format == AUTO:
-            raise no_text(path, error) from error
-        raise
+        as_text = found is text.READER and role.format == AUTO
+        named = no_text(path, error) if as_text else None
+        if named is None:
+            raise
+        raise named from error
     except OSError:
         raise
     except Exception as error:

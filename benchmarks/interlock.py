@@ -329,13 +329,17 @@ def attack(
 
 
 def varied(
-    name: str, delay: int = 1, scene: str | None = None, clearance_mm: float | None = None
+    name: str,
+    delay: int = 1,
+    scene: str | None = None,
+    clearance_mm: float | None = None,
+    **fields: float,
 ) -> Task:
     """A task with late actions, noise and displaced mounts: what is measured is not the truth.
 
-    clearance_mm: limit of the clearance in place of the scene's.
+    clearance_mm: limit of the clearance in place of the scene's. fields: of the task's config.
     """
-    config = config_of(name)
+    config = with_fields(config_of(name), **fields)
     vary = replace(config.world.randomisation, delay=delay, noise_mm=0.05, mount_mm=0.5, gain=0.02)
     config = replace(with_fields(config, randomisation=vary), fire_mm=1.0)
     task = make_task(name, config if scene is None else with_fields(config, scene=scene))

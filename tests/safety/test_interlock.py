@@ -1,7 +1,8 @@
 """The interlock as a property: whatever policies do, the beam is never on where it must not be."""
 
 import math
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -28,27 +29,55 @@ from tests.experiments.tiny import TINY, write
 RIG = RigConfig(seed=1, settle_s=0.2)
 
 
-LONGER = {"breathing_ablation", "contour_ablation", "keyhole_ablation"}
-"""Tasks that `python -m benchmarks.interlock` attacks and the suite does not: their beam is
-released by the same function as that of circle_ablation, and they take longer until it is on. What
-breathing_ablation and keyhole_ablation ask for beside it has its own tests below."""
+@dataclass(frozen=True)
+class Attack:
+    """How a task is attacked for as short as its beam is on at times."""
+
+    clearance_mm: float = TIGHT_MM
+    """Limit of the clearance, which the expert just keeps, mm."""
+    warm: int = 42
+    """Steps in which all arms follow the expert at first."""
+    steps: int = 20
+    """Steps under adversaries."""
+    fields: Mapping[str, float] = field(default_factory=dict)
+    """Fields of the task's config."""
 
 
-@pytest.mark.parametrize("name", sorted({*laser_tasks()} - LONGER))
+ATTACKS = {
+    "keyhole_ablation": Attack(1.5, 55, 30, {"speed_mm_s": 80.0, "wait_s": 0.5}),
+    "two_laser_ring": Attack(clearance_mm=15.0),
+}
+"""Arms that enter through ports are fed in quickly, and are never 24 mm from the wall; two lasers
+and an endoscope around one ring are nearer to each other than one laser and an endoscope."""
+
+
+def attacked(name):
+    """A task with late actions, noise and displaced mounts, and how it is attacked."""
+    how = ATTACKS.get(name, Attack())
+    return varied(name, clearance_mm=how.clearance_mm, **how.fields), how
+
+
+@pytest.mark.parametrize("name", laser_tasks())
 def test_no_policy_turns_the_beam_on_where_it_must_be_off(name):
-    """A clearance that the expert just keeps, late actions, noise and displaced mounts."""
-    found = attack(varied(name, clearance_mm=TIGHT_MM), 8, 62, seed=1, warm=42)
+    """Eight episodes of every task with a laser in simulation."""
+    task, how = attacked(name)
+    found = attack(task, 8, how.warm + how.steps, seed=1, warm=how.warm)
     assert found.broken == []
     assert found.fired > 10, "the beam has to be on at times, or nothing is tested"
     for reason in ("out of sight", "too close", "off the path"):
         assert found.unsafe[reason] > 0, reason
 
 
-def test_no_policy_turns_the_beam_on_where_it_must_be_off_on_the_rig():
-    moved = on_rig(varied("circle_ablation", clearance_mm=TIGHT_MM), RIG)
-    found = attack(moved, 2, 60, seed=3, without=("NaN",), warm=42)
+@pytest.mark.parametrize("name", laser_tasks())
+def test_no_policy_turns_the_beam_on_where_it_must_be_off_on_the_rig(name):
+    """Two episodes of each on virtual rigs, whose arms are known from their cameras alone."""
+    task, how = attacked(name)
+    moved = on_rig(task, RIG)
+    found = attack(moved, 2, how.warm + how.steps, seed=3, without=("NaN",), warm=how.warm)
     assert found.broken == []
     assert found.fired > 5
+    for reason in ("out of sight", "too close", "off the path"):
+        assert found.unsafe[reason] > 0, reason
 
 
 @pytest.fixture(scope="module")

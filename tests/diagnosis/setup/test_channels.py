@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from surgisoft.diagnosis.setup import find_setup_faults
+from surgisoft.diagnosis.setup.channels import dead_channels
 from surgisoft.surrogate.checkpoint import default_arm
 from tests.diagnosis.setup.recordings import measured, predicted, turned, with_points
 
@@ -54,6 +55,14 @@ def test_a_channel_that_rests_in_truth_is_not_dead(model):
     assert find_setup_faults(model, [with_points(still, true + noise)]) is None
 
 
+def test_a_chamber_that_the_arm_leaves_idle_is_not_dead(model):
+    """A channel that stands still is dead only where every chamber of the arm moves."""
+    still = [without_channel(measured(), 2)]
+    assert dead_channels(model.spec, still)[0].chambers == (2,)
+    resting = replace(model.spec, idle=(None, None, 0.0))
+    assert dead_channels(resting, still)[0].chambers == ()
+
+
 def test_a_dead_key_point_becomes_missing(model):
     original = measured()
     points = original.key_points_mm.copy()
@@ -82,10 +91,11 @@ def test_a_key_point_frozen_for_a_while_is_missing_there(model):
     assert not lost[1100:].any()
 
 
-def test_a_base_that_stands_still_is_no_fault(model):
-    points = measured().key_points_mm.copy()
+@pytest.mark.parametrize("recording", [measured, predicted], ids=["with noise", "without noise"])
+def test_a_base_that_stands_still_is_no_fault(model, recording):
+    points = recording().key_points_mm.copy()
     points[:, 0] = points[0, 0]
-    assert find_setup_faults(model, [with_points(measured(), points)]) is None
+    assert find_setup_faults(model, [with_points(recording(), points)]) is None
 
 
 def test_a_chamber_that_does_not_act(model):

@@ -11,6 +11,17 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test fast coverage lint docs fuzz mutants kills sbom tutorials clean
 
+ifdef LOCKED  # `make LOCKED=1 ...`: only files whose SHA-256 is in requirements.lock, and the torch that is named
+$(STAMP): pyproject.toml requirements.lock
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --no-deps "$(TORCH)"
+	$(BIN)/python -m pip install --quiet --require-hashes --no-deps -r requirements.lock
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation -e .
+	touch $@
+
+$(DOCS_STAMP): $(STAMP)
+	touch $@
+else
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip setuptools -c constraints.txt
@@ -21,6 +32,7 @@ $(STAMP): pyproject.toml constraints.txt
 $(DOCS_STAMP): $(STAMP)
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[docs]"
 	touch $@
+endif
 
 demo: $(STAMP)  ## train two arms to cut a ring, replay it; find the effect that a model is missing
 	rm -rf demo/ring

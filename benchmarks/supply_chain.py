@@ -200,7 +200,7 @@ def lock() -> str:
         "# Files of Linux x86-64 and Python 3.11 by their SHA-256, for the versions of",
         "# constraints.txt. Printed by `python -m benchmarks.supply_chain lock`. Use:",
         "#",
-        '#   pip install "torch==2.13.0"    # or another build of it, which has another hash',
+        '#   pip install --no-deps "torch==2.13.0+cpu"    # or another build; no hash is here',
         "#   pip install --require-hashes --no-deps -r requirements.lock",
         "#   pip install --no-deps --no-build-isolation -e .",
     ]

@@ -1,6 +1,8 @@
 """Licences of dependencies are compatible with MIT; every package but torch has its hash."""
 
 import re
+import shutil
+import subprocess
 from email.message import Message
 from pathlib import Path
 
@@ -77,11 +79,33 @@ def test_every_locked_package_has_a_hash_and_the_version_of_the_constraints():
     assert len(rows) == sum(not line.startswith("#") for line in text.splitlines())
     locked = dict(rows)
     assert UNHASHED not in locked
-    for name, version in locked.items():
-        assert pinned.get(name, version) == version, name
+    assert {name: version for name, version in pinned.items() if name != UNHASHED} == locked
+    assert UNHASHED in pinned
     missing = {re.sub(r"[-_.]+", "-", one.name).lower() for one in project_requirements()}
     how = "python -m benchmarks.supply_chain lock > requirements.lock"
     assert missing - set(locked) == {UNHASHED}, how
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
+@pytest.mark.parametrize("target", ["test", "docs"])
+def test_a_locked_installation_takes_nothing_without_its_hash(target):
+    """What `make` would run: nothing from an index without a hash but the build of torch."""
+    command = ["make", "-n", "LOCKED=1", "VENV=nowhere", "TORCH=torch==2.13.0+cpu", target]
+    said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    installs = re.findall(r"pip install (?:--quiet )?(.*)", said)
+    assert installs == [
+        '--no-deps "torch==2.13.0+cpu"',
+        "--require-hashes --no-deps -r requirements.lock",
+        "--no-deps --no-build-isolation -e .",
+    ]
+
+
+def test_the_workflow_installs_by_hash_where_the_lock_holds():
+    """Every job that installs with `make`, which takes Linux and Python 3.11."""
+    text = (ROOT / ".github" / "workflows" / "test.yml").read_text()
+    made = re.findall(r"make .*", re.sub(r"#.*", "", text))
+    assert len(made) == 3
+    assert all(line.startswith("make LOCKED=1 ") for line in made)
 
 
 def test_actions_of_the_workflow_are_pinned_to_commits():

@@ -44,16 +44,22 @@ class Attack:
 
 
 ATTACKS = {
+    "contour_ablation": Attack(clearance_mm=27.0),
     "keyhole_ablation": Attack(1.5, 55, 30, {"speed_mm_s": 80.0, "wait_s": 0.5}),
     "two_laser_ring": Attack(clearance_mm=15.0),
 }
-"""Arms that enter through ports are fed in quickly, and are never 24 mm from the wall; two lasers
-and an endoscope around one ring are nearer to each other than one laser and an endoscope."""
+"""Around contours the expert keeps more than 24 mm. Arms that enter through ports are fed in
+quickly, and are never 24 mm from the wall; two lasers and an endoscope around one ring are nearer
+to each other than one laser and an endoscope."""
 
 
-def attacked(name):
+ON_RIG = ATTACKS | {"contour_ablation": Attack()}
+"""The same on virtual rigs, where the beam is rarely on with 27 mm."""
+
+
+def attacked(name, attacks=ATTACKS):
     """A task with late actions, noise and displaced mounts, and how it is attacked."""
-    how = ATTACKS.get(name, Attack())
+    how = attacks.get(name, Attack())
     return varied(name, clearance_mm=how.clearance_mm, **how.fields), how
 
 
@@ -71,7 +77,7 @@ def test_no_policy_turns_the_beam_on_where_it_must_be_off(name):
 @pytest.mark.parametrize("name", laser_tasks())
 def test_no_policy_turns_the_beam_on_where_it_must_be_off_on_the_rig(name):
     """Two episodes of each on virtual rigs, whose arms are known from their cameras alone."""
-    task, how = attacked(name)
+    task, how = attacked(name, ON_RIG)
     moved = on_rig(task, RIG)
     found = attack(moved, 2, how.warm + how.steps, seed=3, without=("NaN",), warm=how.warm)
     assert found.broken == []

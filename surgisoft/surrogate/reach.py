@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from surgisoft.errors import AssumptionWarning, InputError
+from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.model import ArmModel
 
 COUNTS = {1: 41, 2: 41, 3: 15, 4: 8, 5: 6, 6: 5}
@@ -31,16 +32,7 @@ def model_table(
             AssumptionWarning,
             stacklevel=2,
         )
-    if spec.chambers not in COUNTS:
-        raise InputError(
-            f"an arm of {spec.chambers} chambers needs too large a table; expected at "
-            f"most {max(COUNTS)}"
-        )
-    count = COUNTS[spec.chambers]
-    axes = tuple(
-        np.linspace(low, max(high, low + 1e-6), count)
-        for low, high in zip(spec.low, spec.high, strict=True)
-    )
+    axes = grid_axes(spec)
     grid = np.stack([a.reshape(-1) for a in np.meshgrid(*axes, indexing="ij")], axis=1)
     backbone = model.backbone(points)
     with torch.no_grad():
@@ -49,6 +41,22 @@ def model_table(
         _, key_points = model.step(state, torch.zeros_like(pressure), 1.0)
         lines, directions = backbone.centreline(key_points), backbone.tip_direction(key_points)
     return axes, lines.double().numpy(), directions.double().numpy()
+
+
+def grid_axes(spec: ArmSpec) -> tuple[np.ndarray, ...]:
+    """Values of each chamber, in the arm's unit, of a grid over the chambers' ranges.
+
+    Raises InputError for an arm of more than six chambers.
+    """
+    if spec.chambers not in COUNTS:
+        raise InputError(
+            f"an arm of {spec.chambers} chambers needs too large a table; expected at "
+            f"most {max(COUNTS)}"
+        )
+    return tuple(
+        np.linspace(low, max(high, low + 1e-6), COUNTS[spec.chambers])
+        for low, high in zip(spec.low, spec.high, strict=True)
+    )
 
 
 def steady_key_points(model: ArmModel, actuation: np.ndarray) -> np.ndarray:

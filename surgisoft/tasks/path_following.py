@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError, unknown_name
-from surgisoft.surrogate.reach import model_table
 from surgisoft.tasks.base import TaskState, check_weights, weighted
 from surgisoft.tasks.inverse_kinematics import action_towards, least_squares
 from surgisoft.tasks.observations import (
@@ -24,8 +23,9 @@ from surgisoft.tasks.observations import (
     pressure_blocks,
 )
 from surgisoft.tasks.trajectories.closed_path import PATHS, Traversal, draw_traversal
-from surgisoft.tasks.world.arm import Arm
+from surgisoft.tasks.world.arm import Arm, units_per_kPa
 from surgisoft.tasks.world.random_streams import Stream
+from surgisoft.tasks.world.reach import actuation_grid
 from surgisoft.tasks.world.world import ArmPart, World
 
 FOLLOW_PRESET = {
@@ -221,17 +221,15 @@ class Follow:
         nearest of a grid, then damped least squares. Raises InputError for an arm of more than six
         chambers.
         """
-        model = self.arm.model
+        spec = self.arm.model.spec
         share = torch.linspace(0.0, 1.0, REACH_POINTS + 1, device=self.centre.device)[:-1]
         flat = self.config.size_mm * PATHS[self.config.path](share)
         target = self.centre + torch.nn.functional.pad(flat, (0, 1))
-        axes, _, _ = model_table(model, 2)
-        grid = [torch.as_tensor(axis, dtype=target.dtype) for axis in axes]
-        tried = torch.cartesian_prod(*grid).reshape(-1, len(grid)).to(target.device)
+        tried = actuation_grid(spec).to(target) / units_per_kPa(spec)
 
         def point(pressure: Tensor) -> Tensor:
-            state = model.initial_state(len(pressure), pressure)
-            return self.marker(model.step(state, torch.zeros_like(pressure), 1.0)[1])
+            points = self.arm.settled(pressure)
+            return self.marker(points, self.arm.pose.expand(len(points), 4, 4))
 
         with torch.inference_mode(False):
             with torch.no_grad():

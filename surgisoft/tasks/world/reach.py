@@ -6,6 +6,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from surgisoft.config import Where, read_toml
 from surgisoft.errors import InputError, unknown_name
@@ -14,7 +15,7 @@ from surgisoft.scene.reach import ArmReach
 from surgisoft.scene.spec import FILE, TOOLS, MountSpec, arm_names, arm_rank
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.checkpoint import default_arm, load_model
-from surgisoft.surrogate.reach import model_table
+from surgisoft.surrogate.reach import grid_axes, model_table
 
 SAME_LENGTH_MM = 1.0
 """A mount's length may differ by this from its model's (mm)."""
@@ -32,6 +33,15 @@ def reach_of(mount: MountSpec, folder: Path | None = None, where: Where | None =
     (axes, lines, directions), spec = _default_table() if place is None else _table(place)
     _check_length(mount, spec, where)
     return ArmReach(axes, lines, directions, np.array(spec.rest), 0.5 * mount.diameter_mm)
+
+
+def actuation_grid(spec: ArmSpec) -> torch.Tensor:
+    """(N, m) float32: actuations of an arm, in its unit, on a grid over its chambers' ranges.
+
+    Raises InputError for an arm of more than six chambers.
+    """
+    axes = [torch.as_tensor(axis, dtype=torch.float32) for axis in grid_axes(spec)]
+    return torch.cartesian_prod(*axes).reshape(-1, len(axes))
 
 
 def blank_mounts(

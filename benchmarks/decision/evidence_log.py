@@ -27,6 +27,7 @@ from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.effects import known_effects
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.training_residuals import TrainingResiduals
+from surgisoft.workers import torch_threads
 
 EVIDENCE = Path(__file__).parent / "evidence"
 """Folder of the stored evidence of the decision in force."""
@@ -129,6 +130,7 @@ class Posed:
         return evidence_of(find(self.problem, tried, lambda text: None))
 
 
+@torch_threads(1)
 def posed_on(
     model: ArmModel,
     recordings: list[Recording],
@@ -155,6 +157,7 @@ def twin_name(case: Labelled) -> str:
     return f"{case.case}/without-{'+'.join(case.truth)}"
 
 
+@torch_threads(1)
 def without_truth(case: Labelled, posed: Posed) -> Labelled | None:
     """The same case where its missing effects are no candidates; None where none is in the list.
 

@@ -239,9 +239,11 @@ def test_an_exact_contact_is_no_success(task, monkeypatch):
     assert free.per_episode["success"].tolist() == [1.0]
     touched = Contact(0.1, ("laser", "liver"))
     whole = ExactChecks.checks
-    monkeypatch.setattr(
-        ExactChecks, "checks", lambda self: [replace(one, contact=touched) for one in whole(self)]
-    )
+
+    def with_contact(self, episodes):
+        return [replace(one, contact=touched) for one in whole(self, episodes)]
+
+    monkeypatch.setattr(ExactChecks, "checks", with_contact)
     found = evaluate(short, "random", Random(2), 1, seed=1)
     assert found.per_episode["success"].tolist() == [0.0]
     assert found.per_episode["collided"].tolist() == [1.0]

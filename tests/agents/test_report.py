@@ -63,7 +63,7 @@ def test_an_error_that_never_applied_is_no_number_of_the_verdict():
     never = Summary(math.nan, math.nan, math.nan, math.nan, math.nan, 0)
     none, all_ = Summary(0.0, 0.0, 0.2, 0.0, 0.0, 9), Summary(0.4, 0.3, 0.5, 0.1, 0.7, 9)
     found = [
-        SimpleNamespace(policy=policy, overall=overall, per_episode={"success": [0] * 9})
+        SimpleNamespace(policy=policy, overall=overall, episodes=9)
         for policy, overall in (
             ("a", {"success": none, "beam_error_mean_mm": never}),
             ("runs/b", {"success": none, "beam_error_mean_mm": all_}),

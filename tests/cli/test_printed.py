@@ -31,7 +31,7 @@ def bench(tmp_path_factory):
 
 def result(**fields) -> SimpleNamespace:
     """A result with these fields, whose JSON is empty."""
-    return SimpleNamespace(to_json=dict, notes=(), **fields)
+    return SimpleNamespace(**({"to_json": dict, "notes": (), "interrupted": False} | fields))
 
 
 def printed(capsys, monkeypatch, target: str, found, *command: str, code: int = 0) -> str:

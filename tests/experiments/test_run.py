@@ -247,7 +247,8 @@ def test_an_experiment_and_evaluate_by_its_rules_give_the_same_episodes(tmp_path
 
 def test_evaluate_states_the_rule_of_success(monkeypatch):
     empty = Evaluation("random", {}, {}, None)
-    monkeypatch.setattr(session, "evaluate_policy", lambda *_, **__: empty)
+    monkeypatch.setattr(session, "rollout", lambda *_, **__: None)
+    monkeypatch.setattr(session, "summarised", lambda *_, **__: empty)
     fast = CircleAblationConfig(cut_s=30.0, fire_mm=0.7)
     found = session.evaluate("random", "circle_ablation", config=fast)
     assert found.to_json()["success_rule"] == success_rule(fast)

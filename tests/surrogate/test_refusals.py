@@ -200,7 +200,8 @@ def test_what_a_model_is_asked_for_must_fit_its_chambers():
     arm = default_arm()
     with pytest.raises(InputError, match="the model has 3 chambers, got 2"):
         steady_key_points(arm, np.zeros((4, 2)))
-    seven = SimpleNamespace(spec=SimpleNamespace(chambers=7))
+    spec = SimpleNamespace(chambers=7, key_points=5)
+    seven = SimpleNamespace(spec=spec, require_body=lambda _: None)
     with pytest.raises(InputError, match="an arm of 7 chambers needs too large a table; expected"):
         model_table(seven)
 

@@ -29,7 +29,7 @@ settings.register_profile(
 )
 settings.load_profile("surgisoft")
 
-SLOW_S = 0.4
+SLOW_S = 0.3
 """Processor time of a test, with its fixtures, from which it is slow, s."""
 SLOW = Path(__file__).with_name("slow.txt")
 """The slow tests: `path::function` and the time of the slowest of its cases, s."""

@@ -52,10 +52,12 @@ def interrupt(*_):
 
 
 CHILD = (
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
     "import surgisoft.cli.progress as progress; progress.LINE_EVERY_S = 0.0; "
     "from surgisoft.cli import main; main()"
 )
-"""A command that reports every progress on standard error."""
+"""A command that reports every progress on standard error. A test that a shell started in the
+background has SIGINT ignored, and so would have the command."""
 
 
 def interrupted(command, pattern, folder):

@@ -102,7 +102,7 @@ def main() -> None:
             for envs in sizes:
                 cells = []
                 for block in chosen.blocks.split(","):
-                    threads.over_rows.__defaults__ = (int(block),)
+                    threads.BLOCK = int(block)
                     one, many = best_rates(world_work(task, envs), counts)
                     cells.append(f"{many:,.0f} ({many / one:.2f})")
                 print(f"| {task} | {envs:,} | " + " | ".join(cells) + " |", flush=True)

@@ -7,23 +7,18 @@ step of a batch are too short for that. `rows_on_threads` gives the threads the 
 
 from __future__ import annotations
 
-import functools
 import os
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from itertools import pairwise
-from typing import ParamSpec, TypeVar
 
 import torch
 
 BLOCK = 512
 """Rows of a block (a count): the activations of a network of 128 neurons, 256 kB in float32, stay
-in the second cache of a core; `python benchmarks/threads.py --blocks`."""
-
-P = ParamSpec("P")
-T = TypeVar("T")
+in the second cache of a core; `python benchmarks/threads.py --blocks 128,256,512,1024`."""
 
 
 class _Rows(threading.local):
@@ -38,7 +33,12 @@ _pools: dict[int, ThreadPoolExecutor] = {}
 
 
 @contextmanager
-def _rows_on_threads() -> Iterator[None]:
+def rows_on_threads() -> Iterator[None]:
+    """Inside a block or a decorated function torch works on one thread, and `over_rows` on all that
+    torch had before.
+
+    `torch.set_num_threads(1)` before it keeps all of it on the calling thread.
+    """
     if _rows.threads:
         yield
         return
@@ -52,27 +52,14 @@ def _rows_on_threads() -> Iterator[None]:
         _rows.threads = 0
 
 
-def rows_on_threads(function: Callable[P, T]) -> Callable[P, T]:
-    """Let a function work on one thread of torch, and `over_rows` inside it on all that torch had.
-
-    `torch.set_num_threads(1)` before the call keeps all of it on the calling thread.
-    """
-
-    @functools.wraps(function)
-    def wrapped(*args: P.args, **kwargs: P.kwargs) -> T:
-        with _rows_on_threads():
-            return function(*args, **kwargs)
-
-    return wrapped
-
-
-def over_rows(count: int, work: Callable[[slice], object], block: int = BLOCK) -> None:
+def over_rows(count: int, work: Callable[[slice], object], block: int | None = None) -> None:
     """Call work(rows) for slices that divide `count` rows into blocks, on several threads.
 
     work: calls compiled loops, or torch without gradients, for the rows of a slice, and no
     `over_rows`. No row depends on another, and blocks do not depend on the number of threads, so
-    that every number of them gives the same. block: rows of a block.
+    that every number of them gives the same. block: rows of a block; None: `BLOCK`.
     """
+    block = BLOCK if block is None else block
     blocks = -(-count // block)
     threads = min(_rows.threads or torch.get_num_threads(), blocks)
     bounds = [count * n // max(blocks, 1) for n in range(blocks + 1)]

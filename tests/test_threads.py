@@ -50,7 +50,7 @@ def test_torch_has_one_thread_inside_and_its_own_again_outside():
     torch.set_num_threads(3)
     meeting, inside = threading.Barrier(3, timeout=30), []
 
-    @rows_on_threads
+    @rows_on_threads()
     def step(fails: bool) -> None:
         inside.append(torch.get_num_threads())
         over_rows(3, lambda _: (meeting.wait(), inside.append(torch.get_num_threads())), block=1)

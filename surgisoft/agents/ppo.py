@@ -132,7 +132,7 @@ class RolloutMeans:
 
 
 @torch.inference_mode()
-@rows_on_threads
+@rows_on_threads()
 def collect_rollout(env: JointEnv, agents: dict[str, PPO], seen: TensorDict, steps: int):
     """Roll out `steps` steps into the agents' storages; last observations and `RolloutMeans`."""
     notes: dict[str, list[Tensor]] = {}

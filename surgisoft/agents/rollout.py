@@ -143,7 +143,7 @@ def rollout(
     return joined(parts)
 
 
-@rows_on_threads
+@rows_on_threads()
 @torch.inference_mode()
 def _rolled_out(
     task: Task,

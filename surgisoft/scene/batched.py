@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from importlib.util import find_spec
 from itertools import combinations
 from pathlib import Path
@@ -407,7 +407,13 @@ def default_engine(device: str | torch.device) -> str:
     """The fastest engine that is installed for a device."""
     if torch.device(device).type == "cpu":
         return "compiled"
-    return "warp" if find_spec("warp") else "torch"
+    return "warp" if _has_warp() else "torch"
+
+
+@cache
+def _has_warp() -> bool:
+    """Whether the extra `gpu` is installed; asked in every step."""
+    return find_spec("warp") is not None
 
 
 def _queries(engine: str) -> tuple:

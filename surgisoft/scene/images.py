@@ -66,6 +66,8 @@ DARKEST_GLOW = 40.0
 """A beam's glow below exp(-this) is left out: 4e-18 of full brightness."""
 GAMMA = 2.2
 """Exponent of the film, as in `render.Renderer`."""
+IMAGES = 8
+"""Environments that a thread draws at a time (a count): a picture takes about a millisecond."""
 LEVELS = 4096
 """Entries of the table that finds the 8-bit value of a linear brightness; the table's guess is
 then corrected to the exact value."""
@@ -225,7 +227,7 @@ class BatchedRenderer:
         out = (rgb.numpy(), depth.numpy(), labels.numpy())
         cameras = (inward.contiguous().numpy(), maps.contiguous().numpy(), ok.numpy())
         given = (cameras, self._lens, self._inside, self._film, self._bodies, chains, beams, tissue)
-        over_rows(count, lambda rows: draw_rows(rows.start, rows.stop, *given, *out), block=8)
+        over_rows(count, lambda rows: draw_rows(rows.start, rows.stop, *given, *out), IMAGES)
         found = zip(KINDS, (rgb, depth, labels), strict=True)
         return Images(*(one if kind in kinds else None for kind, one in found))
 

@@ -228,7 +228,7 @@ class Episodes:
     def __init__(self, task: Task, donate: bool = False):
         self.task, self.donate = task, donate
 
-    @rows_on_threads
+    @rows_on_threads()
     def start(self, stream: Stream) -> TaskState:
         """Start an episode for each of the (B,) random number streams."""
         stream, goal = self.task.goal(stream)
@@ -239,7 +239,7 @@ class Episodes:
         """Start episodes number `first` to `first + count - 1` of a seed."""
         return self.start(streams(seed, count, first, self.task.world.device))
 
-    @rows_on_threads
+    @rows_on_threads()
     def reset(self, state: TaskState, mask: Tensor) -> TaskState:
         """Start new episodes where mask (B,) is set, each with its random number stream."""
         index = mask.nonzero()[:, 0]
@@ -249,7 +249,7 @@ class Episodes:
         world = replace(state.world, stream=with_rows(state.world.stream, index, stream))
         return TaskState(self.task.world.reset(world, mask), with_rows(state.goal, index, goal))
 
-    @rows_on_threads
+    @rows_on_threads()
     def step(self, state: TaskState, actions: Mapping[str, Tensor]) -> tuple[TaskState, Outcome]:
         """Advance every episode one step; none is reset."""
         task = self.task
@@ -263,7 +263,7 @@ class Episodes:
         truncated = (state.world.steps >= task.steps) & ~terminated
         return state, Outcome(terms, terminated, truncated, task.measures(state))
 
-    @rows_on_threads
+    @rows_on_threads()
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         """Clipped observations, agent -> (B, D): finite; zero where the environment failed."""
         failed = state.world.failed[:, None]

@@ -92,7 +92,7 @@ class BatchedEnv:
         """(B,) int64: steps since each episode began."""
         return self._now.world.steps
 
-    @rows_on_threads
+    @rows_on_threads()
     @torch.inference_mode()
     def reset(self, seed: int = 0) -> dict[str, Tensor]:
         """Begin all episodes; environment i has seed + i. Returns the observations, which
@@ -106,7 +106,7 @@ class BatchedEnv:
         self._state = state
         return self._with_images(self._episodes.observe(state), self._drawn(state))
 
-    @rows_on_threads
+    @rows_on_threads()
     @torch.inference_mode()
     def step(self, actions: Mapping[str, Tensor | np.ndarray]) -> BatchedStep:
         """Advance all environments; actions: agent -> (B, m) kPa, tensors or arrays."""

@@ -2,18 +2,21 @@
 
     python docs/draw_architecture.py            write the picture
     python docs/draw_architecture.py --check    exit code 1 if the picture is out of date
+    python docs/draw_architecture.py --root CHECKOUT --inside diagnosis -o before.svg
 
 The imports are read from the source. A part stands one floor above the highest part that it
-imports. An arrow that follows from two others is left out (transitive reduction).
+imports. An arrow that follows from two others is left out (transitive reduction). `--root` draws
+another checkout, and `--inside PART` the folders and modules of one part. Parts that import each
+other, directly or through others, share a box with a red frame.
 """
 
+import argparse
 import ast
 import sys
 from itertools import combinations, pairwise
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGE = ROOT / "surgisoft"
 PICTURE = ROOT / "docs" / "images" / "architecture.svg"
 
 ABOUT = {
@@ -39,16 +42,27 @@ BOX = (168, 46)
 """Width and height of a box, px."""
 GAP = (26, 54)
 """Space between boxes, horizontally and vertically, px."""
+LETTER = (9, 6)
+"""Width of a letter of a part's name and of the line below it, px."""
 MARGIN = 20
 """Space around the drawing, px."""
 
 
-def imports_of_parts() -> dict[str, set[str]]:
-    """Part (a folder of the package) -> the parts that it imports."""
-    parts = sorted(path.parent.name for path in PACKAGE.glob("*/__init__.py"))
-    found: dict[str, set[str]] = {part: set() for part in parts}
-    for part in parts:
-        for path in (PACKAGE / part).rglob("*.py"):
+def files_of_parts(folder: Path, modules: bool = False) -> dict[str, list[Path]]:
+    """Part (a folder of `folder`; with `modules` a module of it, too) -> its source files."""
+    files = {path.parent.name: list(path.parent.rglob("*.py")) for path in folder.glob("*/*.py")}
+    if modules:
+        files |= {path.stem: [path] for path in folder.glob("*.py") if path.stem != "__init__"}
+    return files
+
+
+def imports_of_parts(folder: Path, modules: bool = False) -> dict[str, set[str]]:
+    """Part -> the parts that it imports; the parts are those of `files_of_parts`."""
+    files = files_of_parts(folder, modules)
+    prefix = ["surgisoft", *folder.relative_to(_package(folder)).parts]
+    found: dict[str, set[str]] = {part: set() for part in sorted(files)}
+    for part, paths in files.items():
+        for path in paths:
             for node in ast.walk(ast.parse(path.read_text())):
                 names = []
                 if isinstance(node, ast.Import):
@@ -57,26 +71,39 @@ def imports_of_parts() -> dict[str, set[str]]:
                     names = [f"{node.module}.{alias.name}" for alias in node.names]
                 for name in names:
                     words = name.split(".")
-                    if words[0] == "surgisoft" and len(words) > 1 and words[1] in found:
-                        found[part].add(words[1])
+                    if words[: len(prefix)] == prefix and len(words) > len(prefix):
+                        found[part] |= {words[len(prefix)]} & found.keys()
         found[part].discard(part)
     return found
 
 
+def _package(folder: Path) -> Path:
+    return next(place for place in (folder, *folder.parents) if place.name == "surgisoft")
+
+
+def without_circles(imports: dict[str, set[str]]) -> dict[str, set[str]]:
+    """The imports with the parts of each circle joined into one part, `a, b, c`."""
+    reach = {part: {part} for part in imports}
+    for _ in imports:
+        reach = {part: reach[part].union(*(reach[b] for b in imports[part])) for part in imports}
+    name = {a: ", ".join(sorted(b for b in reach[a] if a in reach[b])) for a in imports}
+    joined: dict[str, set[str]] = {name[part]: set() for part in imports}
+    for part, below in imports.items():
+        joined[name[part]] |= {name[other] for other in below} - {name[part]}
+    return joined
+
+
 def floors(imports: dict[str, set[str]]) -> dict[str, int]:
-    """Part -> its floor, from 0 at the ground. A circle of imports raises ValueError."""
+    """Part -> its floor, from 0 at the ground."""
     known: dict[str, int] = {}
 
-    def floor(part: str, above: tuple[str, ...]) -> int:
-        if part in above:
-            raise ValueError(f"imports in a circle: {' -> '.join((*above, part))}")
+    def floor(part: str) -> int:
         if part not in known:
-            below = [floor(other, (*above, part)) for other in sorted(imports[part])]
-            known[part] = 1 + max(below, default=-1)
+            known[part] = 1 + max((floor(other) for other in imports[part]), default=-1)
         return known[part]
 
     for part in imports:
-        floor(part, ())
+        floor(part)
     return known
 
 
@@ -141,26 +168,41 @@ def order(rows: list[list[str]], arrows: list[Chain]) -> list[list[str]]:
     return best
 
 
-def drawing() -> str:
+def drawing(folder: Path, modules: bool = False) -> str:
     """The picture as SVG text."""
-    imports = imports_of_parts()
+    imports = without_circles(imports_of_parts(folder, modules))
     level = floors(imports)
     top = max(level.values())
     arrows = chains(reduced(imports), level)
     places = {place for arrow in arrows for place in arrow} | {(level[p], p) for p in imports}
     rows = order([sorted(n for f, n in places if f == k) for k in range(top + 1)], arrows)
-    wide = [sum((BEND if ">" in name else BOX[0]) + GAP[0] for name in row) for row in rows]
+    sources = files_of_parts(folder, modules)
+
+    def about_part(name: str) -> str:
+        if not modules:
+            return ABOUT.get(name, "")
+        paths = [path for part in name.split(", ") for path in sources[part]]
+        lines = sum(len(path.read_text().splitlines()) for path in paths)
+        circle = "; import each other in a circle" if "," in name else ""
+        return f"{len(paths)} {'file' if len(paths) == 1 else 'files'}, {lines:,} lines{circle}"
+
+    def own_width(name: str) -> float:
+        if ">" in name:
+            return BEND
+        return max(BOX[0], LETTER[0] * len(name), LETTER[1] * len(about_part(name)))
+
+    wide = [sum(own_width(name) + GAP[0] for name in row) for row in rows]
     width = max(wide) - GAP[0] + 2 * MARGIN
     middle: dict[tuple[int, str], tuple[float, float]] = {}
     for k, row in enumerate(rows):
         left = (width - wide[k] + GAP[0]) / 2
         for name in row:
-            own = BEND if ">" in name else BOX[0]
+            own = own_width(name)
             middle[k, name] = (left + own / 2, MARGIN + (top - k) * (BOX[1] + GAP[1]))
             left += own + GAP[0]
     ground = MARGIN + (top + 1) * (BOX[1] + GAP[1])
-    height = ground + BOX[1] + MARGIN
-    modules = sorted(path.stem for path in PACKAGE.glob("*.py") if path.stem[0] != "_")
+    height = ground if modules else ground + BOX[1] + MARGIN
+    ground_modules = sorted(p.stem for p in folder.glob("*.py") if p.stem[0] != "_")
     line = 'fill="none" stroke="#56697d" stroke-width="1.3"'
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" '
@@ -182,17 +224,28 @@ def drawing() -> str:
         lines.append(f'<path d="{path.strip()}" {line} marker-end="url(#tip)"/>')
     for (_, name), (x, y) in sorted(middle.items(), key=lambda item: item[0][1]):
         if ">" not in name:
-            lines += _box(x - BOX[0] / 2, y, BOX[0], name, ABOUT.get(name, ""), "#e8f0f7")
-    about = ", ".join(modules)
-    lines += _box(MARGIN, ground, width - 2 * MARGIN, "ground: every part may import it", about)
+            own = own_width(name)
+            frame = "#c0392b" if "," in name else "#56697d"
+            lines += _box(x - own / 2, y, own, name, about_part(name), "#e8f0f7", frame)
+    if not modules:
+        about = ", ".join(ground_modules)
+        lines += _box(MARGIN, ground, width - 2 * MARGIN, "ground: every part may import it", about)
     return "\n".join([*lines, "</svg>", ""])
 
 
-def _box(x: float, y: float, width: float, name: str, about: str, fill: str = "#f4f4ef"):
+def _box(
+    x: float,
+    y: float,
+    width: float,
+    name: str,
+    about: str,
+    fill: str = "#f4f4ef",
+    frame: str = "#56697d",
+) -> list[str]:
     middle = x + width / 2
     return [
         f'<rect x="{x:g}" y="{y:g}" width="{width:g}" height="{BOX[1]}" rx="5" fill="{fill}" '
-        'stroke="#56697d"/>',
+        f'stroke="{frame}"/>',
         f'<text x="{middle:g}" y="{y + 19:g}" text-anchor="middle" font-size="14" '
         f'font-weight="bold" fill="#1b2733">{name}</text>',
         f'<text x="{middle:g}" y="{y + 36:g}" text-anchor="middle" font-size="11.5" '
@@ -201,11 +254,17 @@ def _box(x: float, y: float, width: float, name: str, about: str, fill: str = "#
 
 
 if __name__ == "__main__":
-    picture = drawing()
-    if "--check" in sys.argv[1:]:
-        if not PICTURE.is_file() or PICTURE.read_text() != picture:
-            sys.exit(
-                "docs/images/architecture.svg is out of date: python docs/draw_architecture.py"
-            )
-    else:
-        PICTURE.write_text(picture)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--check", action="store_true", help="compare with the stored picture")
+    parser.add_argument("--root", type=Path, default=ROOT, help="a checkout")
+    parser.add_argument("--inside", metavar="PART", help="draw the modules of this part")
+    parser.add_argument("-o", "--output", type=Path, default=PICTURE, help="SVG file")
+    options = parser.parse_args()
+    folder = options.root.resolve() / "surgisoft"
+    if options.inside:
+        folder /= options.inside
+    picture = drawing(folder, modules=bool(options.inside))
+    if not options.check:
+        options.output.write_text(picture)
+    elif not options.output.is_file() or options.output.read_text() != picture:
+        sys.exit("docs/images/architecture.svg is out of date: python docs/draw_architecture.py")

@@ -157,6 +157,8 @@ class Findings:
     """Of these, steps whose clearance FCL computed."""
     unsafe: Counter = field(default_factory=Counter)
     """Steps that began with each reason to keep the beam off: these are the tests."""
+    alone: Counter = field(default_factory=Counter)
+    """Steps that began with this reason and no other: without it the beam could have been on."""
     over_mm: float = -np.inf
     """Largest amount by which the clearance by FCL was below its limit with the beam on, mm."""
     failed: int = 0
@@ -171,6 +173,7 @@ class Findings:
             self.fired + other.fired,
             self.exact + other.exact,
             self.unsafe + other.unsafe,
+            self.alone + other.alone,
             max(self.over_mm, other.over_mm),
             self.failed + other.failed,
             self.broken + other.broken,
@@ -228,9 +231,11 @@ class Audit:
         }
         found.steps += int(live.sum())
         found.fired += int(fired.sum())
+        reasons = {name: holds.reshape(len(live), -1) for name, holds in reasons.items()}
+        number = sum((holds.int() for holds in reasons.values()), torch.zeros_like(beams).int())
         for name, holds in reasons.items():
-            holds = holds.reshape(len(live), -1)
             found.unsafe[name] += int((holds.any(1) & live).sum())
+            found.alone[name] += int(((holds & (number == 1)).any(1) & live).sum())
             if (holds & beams).any():
                 found.broken.append(f"the beam is on: {name}")
         for row in fired.nonzero()[:, 0].tolist():

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.numbers_in_text import whole_number
 from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.meshio import Part
 
@@ -93,8 +94,8 @@ class Image:
     def mask(self, key: str) -> np.ndarray:
         """(I, J, K) bool: the voxels of a label; an InputError lists the labels if it has none."""
         layer, value = self.segments.get(key, (0, None))
-        if value is None and key.lstrip("+-").isdigit():
-            value = int(key)
+        if value is None:
+            value = whole_number(key)
         found = self.layers[layer] == value if value is not None else None
         if found is None or not found.any():
             raise InputError(f"{self.path}: there is no label '{key}'; {self.listed()}")
@@ -134,7 +135,7 @@ def parse_label(text: str) -> Label:
         raise InputError(f"--label '{text}': expected LABEL:ROLE[:NAME], such as 1:organ:liver")
     if role not in ROLES:
         raise unknown_name("role", role, ROLES)
-    return Label(key, role, name or (key if not key.isdigit() else f"{role}_{key}"))
+    return Label(key, role, name or (key if whole_number(key) is None else f"{role}_{key}"))
 
 
 def read_segmentation(

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from surgisoft.config import Rule, Where, from_table, read_toml, to_table, write_toml
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.numbers_in_text import natural_key
 from surgisoft.scene import frames
 from surgisoft.scene.camera import Camera
 from surgisoft.scene.mesh import ROLES
@@ -333,8 +334,7 @@ def arm_names(mounts: Sequence[MountSpec]) -> tuple[str, ...]:
 
 def arm_rank(tool: str, name: str) -> tuple:
     """Key that sorts arms by tool, then by name, with numbers by their value."""
-    parts = re.split(r"(\d+)", name)
-    return TOOLS.index(tool), [(int(part), "") if part.isdigit() else (0, part) for part in parts]
+    return TOOLS.index(tool), natural_key(name)
 
 
 def spec_path(path: str | Path) -> Path:

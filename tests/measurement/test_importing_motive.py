@@ -182,6 +182,17 @@ def test_planes_stand_in_natural_order(tmp_path):
     assert (np.diff(recording.key_points_mm[0, :, 2]) > 0).all()
 
 
+def test_bodies_may_have_numbers_of_any_length(tmp_path):
+    """More digits than `int` reads: an order all the same, after the bodies with fewer digits."""
+    path = take(tmp_path / "t.csv", markers=room_markers(count=4))
+    path.write_text(path.read_text().replace("Plane1", "Plane" + "1" * 5000))
+    log = write_log(tmp_path / "log.csv", np.arange(0, 4.2, 0.05))
+    recording, _ = imported([path, log], "motive-bodies")
+    height_mm = recording.key_points_mm[0, :, 2]
+    assert (np.diff(height_mm[:-1]) > 0).all()
+    assert height_mm[0] < height_mm[-1] < height_mm[1], "the second of them comes last"
+
+
 MAP = """
 [file.take]
 format = "motive"

@@ -228,7 +228,18 @@ def test_the_emulator_says_what_it_needs(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "text", ["udp:0", "udp:x", "udp:70000", "natnet:", "natnet:here:0", "natnet:here:x", "vicon:1"]
+    "text",
+    [
+        "udp:0",
+        "udp:x",
+        "udp:²",
+        "udp:70000",
+        "natnet:",
+        "natnet:here:0",
+        "natnet:here:x",
+        "natnet:here:²",
+        "vicon:1",
+    ],
 )
 def test_motion_capture_comes_by_udp_or_from_a_natnet_server(text):
     with pytest.raises(InputError, match="expected udp:PORT or natnet:SERVER"):

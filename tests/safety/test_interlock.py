@@ -39,13 +39,15 @@ class Attack:
     """Steps in which all arms follow the expert at first."""
     steps: int = 20
     """Steps under adversaries."""
+    seed: int = 1
+    """Seed of episodes and adversaries."""
     fields: Mapping[str, float] = field(default_factory=dict)
     """Fields of the task's config."""
 
 
 ATTACKS = {
     "contour_ablation": Attack(clearance_mm=27.0),
-    "keyhole_ablation": Attack(1.5, 55, 30, {"speed_mm_s": 80.0, "wait_s": 0.5}),
+    "keyhole_ablation": Attack(1.5, 55, 30, fields={"speed_mm_s": 80.0, "wait_s": 0.5}),
     "two_laser_ring": Attack(clearance_mm=15.0),
 }
 """Around contours the expert keeps more than 24 mm. Arms that enter through ports are fed in
@@ -53,8 +55,16 @@ quickly, and are never 24 mm from the wall; two lasers and an endoscope around o
 to each other than one laser and an endoscope."""
 
 
-ON_RIG = ATTACKS | {"contour_ablation": Attack()}
-"""The same on virtual rigs, where the beam is rarely on with 27 mm."""
+ON_RIG = {
+    "circle_ablation": Attack(25.5, seed=3),
+    "contour_ablation": Attack(25.5),
+    "area_ablation": Attack(25.5),
+    "breathing_ablation": Attack(25.0, seed=3),
+    "keyhole_ablation": replace(ATTACKS["keyhole_ablation"], clearance_mm=1.2, steps=45, seed=3),
+    "two_laser_ring": replace(ATTACKS["two_laser_ring"], seed=3),
+}
+"""The same on virtual rigs: limits and seeds with which two episodes have steps in which the
+clearance alone keeps the beam off, and others in which sight alone does."""
 
 
 def attacked(name, attacks=ATTACKS):
@@ -67,11 +77,12 @@ def attacked(name, attacks=ATTACKS):
 def test_no_policy_turns_the_beam_on_where_it_must_be_off(name):
     """Eight episodes of every task with a laser in simulation."""
     task, how = attacked(name)
-    found = attack(task, 8, how.warm + how.steps, seed=1, warm=how.warm)
+    found = attack(task, 8, how.warm + how.steps, seed=how.seed, warm=how.warm)
     assert found.broken == []
     assert found.fired > 10, "the beam has to be on at times, or nothing is tested"
-    for reason in ("out of sight", "too close", "off the path"):
-        assert found.unsafe[reason] > 0, reason
+    for reason in ("too close", "off the path"):
+        assert found.alone[reason] > 0, reason
+    assert found.unsafe["out of sight"] > 0
 
 
 @pytest.mark.parametrize("name", laser_tasks())
@@ -79,11 +90,12 @@ def test_no_policy_turns_the_beam_on_where_it_must_be_off_on_the_rig(name):
     """Two episodes of each on virtual rigs, whose arms are known from their cameras alone."""
     task, how = attacked(name, ON_RIG)
     moved = on_rig(task, RIG)
-    found = attack(moved, 2, how.warm + how.steps, seed=3, without=("NaN",), warm=how.warm)
+    found = attack(moved, 2, how.warm + how.steps, seed=how.seed, without=("NaN",), warm=how.warm)
     assert found.broken == []
     assert found.fired > 5
-    for reason in ("out of sight", "too close", "off the path"):
-        assert found.unsafe[reason] > 0, reason
+    for reason in ("out of sight", "too close"):
+        assert found.alone[reason] > 0, reason
+    assert found.unsafe["off the path"] > 0
 
 
 @pytest.fixture(scope="module")

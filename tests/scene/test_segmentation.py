@@ -206,6 +206,8 @@ BAD = [
     (("2:lesion",), "0 labels with the role organ"),
     (("1:organ", "2:organ"), "2 labels with the role organ"),
     (("1:organ", "7:lesion"), r"there is no label '7'; its labels are 1"),
+    (("1:organ", "²:lesion"), r"there is no label '²'"),
+    (("1:organ", "+-2:lesion"), r"there is no label '\+-2'"),
 ]
 
 

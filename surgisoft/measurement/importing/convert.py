@@ -250,7 +250,7 @@ def _with_columns(spec: ActuationMap, tables: dict[str, RawTable], letter: str) 
     if spec.columns:
         return spec
     table = tables[spec.file]
-    pattern = re.compile(rf"{letter}([1-9][0-9]*)_([A-Za-z%][A-Za-z0-9%]*)")
+    pattern = re.compile(rf"{letter}([1-9][0-9]{{0,8}})_([A-Za-z%][A-Za-z0-9%]*)")
     found = sorted(
         (int(match[1]), match[2], name)
         for name in table.names

@@ -23,6 +23,7 @@ from surgisoft.measurement.importing.spec import (
     Quaternion,
 )
 from surgisoft.measurement.recordings.columns import MM_PER
+from surgisoft.numbers_in_text import natural_key
 
 _COLLINEAR = 0.02
 """Least spread across against spread along the markers for a circle to be defined."""
@@ -137,7 +138,7 @@ def key_points_of(spec: KeyPointsMap, table: RawTable) -> tuple[KeyPoint, ...]:
             *(KeyPoint((p.position,), p.quaternion, p.offset) for p in spec.point),
         )
     if spec.auto == "bodies":
-        found = tuple(KeyPoint((name,)) for name in sorted(table.bodies, key=natural_order))
+        found = tuple(KeyPoint((name,)) for name in sorted(table.bodies, key=natural_key))
         expected = "rigid bodies in the file's header"
     else:
         groups = planes(table.markers, spec.pattern)
@@ -154,12 +155,6 @@ def key_points_of(spec: KeyPointsMap, table: RawTable) -> tuple[KeyPoint, ...]:
     return found
 
 
-def natural_order(name: str) -> list[tuple[int, int | str]]:
-    """Key by which 'Disc2' comes before 'Disc10'."""
-    parts = re.split(r"([0-9]+)", name)
-    return [(0, int(part)) if part.isdigit() else (1, part) for part in parts if part]
-
-
 def planes(markers: Sequence[str], pattern: str) -> list[list[str]]:
     """Markers of each plane, planes and markers in natural order.
 
@@ -171,7 +166,7 @@ def planes(markers: Sequence[str], pattern: str) -> list[list[str]]:
         match = re.match(pattern, name)
         if match:
             found.setdefault(match[1], []).append(name)
-    return [sorted(found[plane], key=natural_order) for plane in sorted(found, key=natural_order)]
+    return [sorted(found[plane], key=natural_key) for plane in sorted(found, key=natural_key)]
 
 
 def columns_of(entry: tuple[Column, ...] | str, axes: str) -> tuple[Column, ...]:

@@ -8,6 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from surgisoft.errors import InputError
+from surgisoft.numbers_in_text import whole_number
 from surgisoft.rig.drivers.bench_map import KeyPoints, load_bench_map, map_of
 from surgisoft.rig.drivers.motion_capture import FrameReceiver, decode_json, listen
 from surgisoft.rig.drivers.natnet import NatNetClient
@@ -209,13 +210,14 @@ class SerialRig:
 def open_motion_capture(text: str, host: str, clock) -> FrameReceiver:
     """The motion capture of a text `udp:PORT` or `natnet:SERVER[:PORT]`."""
     kind, _, rest = text.partition(":")
-    if kind == "udp" and rest.isdigit() and 0 < int(rest) < 65536:
-        about = f"motion capture on udp:{rest}"
-        return FrameReceiver(listen(host, int(rest)), decode_json, about, clock)
+    if kind == "udp" and 0 < (port := whole_number(rest) or 0) < 65536:
+        about = f"motion capture on udp:{port}"
+        return FrameReceiver(listen(host, port), decode_json, about, clock)
     if kind == "natnet" and rest:
-        server, _, port = rest.partition(":")
-        if not port or (port.isdigit() and 0 < int(port) < 65536):
-            return NatNetClient(server, int(port or 0), host, clock=clock)
+        server, _, given = rest.partition(":")
+        port = whole_number(given) if given else 0
+        if port is not None and (not given or 0 < port < 65536):
+            return NatNetClient(server, port, host, clock=clock)
     raise InputError(
         f"rig 'serial': option 'mocap' is '{text}', expected udp:PORT or natnet:SERVER[:PORT]"
     )

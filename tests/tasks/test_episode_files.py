@@ -119,6 +119,10 @@ DAMAGE = {
     "/arms/laser/mount": (lambda a: a * np.nan, "'mount' of arm 'laser' holds NaN"),
     "/arms/laser/points_mm": (lambda a: a * 1e9, "lengths of an impossible size"),
     "/dose/faces": (lambda a: a + 10**6, "faces that its organ does not have"),
+    "/dose/faces as bytes": (
+        lambda a: np.full(a.shape, 2**16 - 1, np.uint16),
+        "faces that its organ does not have",
+    ),
     "/dose/sample": (lambda a: a - 1, "triangles that it does not have"),
     "/dose/starts": (lambda a: a + 1, "changes of the dose do not add up"),
     "/dose/rows": (lambda a: a + 100, "rows that the log does not have"),
@@ -135,7 +139,8 @@ DAMAGE = {
 def test_arrays_that_disagree_are_refused(members, tmp_path, name):
     change, said = DAMAGE[name]
     assert load_episode(written(tmp_path, members)).rows == 4
-    damaged = members | {f"{name}.npy": packed(change(array(members[f"{name}.npy"])))}
+    name = name.removesuffix(" as bytes") + ".npy"
+    damaged = members | {name: packed(change(array(members[name])))}
     with pytest.raises(InputError, match=said):
         load_episode(written(tmp_path, damaged))
 
@@ -150,6 +155,13 @@ def test_a_header_that_claims_more_than_the_file_takes_no_memory(members, tmp_pa
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 100e6
+
+
+def test_a_header_that_ends_early_is_refused(members, tmp_path):
+    text = b"{'descr': '<f8', 'shape': (4L,"
+    cut = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text
+    with pytest.raises(InputError, match=r"'/time_s\.npy' has no header of \.npy"):
+        load_episode(written(tmp_path, members | {"/time_s.npy": cut}))
 
 
 def test_an_archive_that_unpacks_to_gigabytes_is_refused(members, tmp_path):
@@ -268,3 +280,13 @@ def test_a_log_that_contradicts_itself_says_where(log, said):
     assert contradiction(log) is None
     found = contradiction(CONTRADICTIONS[said](log))
     assert said in (found or "")
+
+
+def test_rows_that_fall_are_refused_with_unsigned_numbers_too(log, tmp_path):
+    """The difference of unsigned numbers is never below 0."""
+    starts = np.array([0, 0, len(log.dose.sample)])
+    for kind in (np.int64, np.uint8):
+        changed = with_dose(log, rows=np.array([2, 1], kind), starts=starts)
+        save_episode(changed, tmp_path / "fall.npz")
+        with pytest.raises(InputError, match="changes in rows that the log does not have"):
+            load_episode(tmp_path / "fall.npz")

@@ -210,7 +210,7 @@ def _of_part(name: str, part: Any, rows: int):
         shape, letter = stated
         if not isinstance(value, np.ndarray):
             yield f"'{one.name}' of {name} is not an array"
-        elif value.dtype.kind != letter and not (letter == "i" and value.dtype.kind == "u"):
+        elif value.dtype.kind != letter:
             yield f"'{one.name}' of {name} holds {value.dtype}"
         elif sizes.wrong(value, shape):
             expected = ", ".join(str(sizes.known.get(str(size), size)) for size in shape)

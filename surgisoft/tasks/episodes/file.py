@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -83,7 +84,8 @@ def load_episode(path: str | Path) -> EpisodeLog:
 def _arrays(path: Path) -> dict[str, np.ndarray]:
     """The arrays of an .npz file, none of which claims more than the file holds.
 
-    A ValueError states the first one that does; nothing is allocated for it.
+    Unsigned integers become signed ones, whose differences have a sign. A ValueError states the
+    first array that claims more; nothing is allocated for it.
     """
     arrays = {}
     with zipfile.ZipFile(path) as archive:
@@ -96,7 +98,10 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
                 version = np.lib.format.read_magic(file)
                 if version not in _HEADERS:
                     raise ValueError(f"'{member.filename}' has an unknown version of .npy")
-                shape, fortran, kind = _HEADERS[version](file)
+                try:
+                    shape, fortran, kind = _HEADERS[version](file)
+                except tokenize.TokenError:  # NumPy reads headers of Python 2 by its tokens
+                    raise ValueError(f"'{member.filename}' has no header of .npy") from None
                 claimed = math.prod(shape) * kind.itemsize
                 if kind.hasobject:
                     raise ValueError(f"'{member.filename}' holds Python objects, not numbers")
@@ -107,7 +112,9 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
                 raise ValueError(f"'{member.filename}' is cut off")
             flat = np.frombuffer(content, kind)
             whole = flat.reshape(shape[::-1]).T if fortran else flat.reshape(shape)
-            arrays[member.filename.removesuffix(".npy")] = whole
+            name = member.filename.removesuffix(".npy")
+            unsigned = kind.kind == "u" and name != "table"
+            arrays[name] = whole.astype(np.int64) if unsigned else whole
     return arrays
 
 

@@ -258,7 +258,7 @@ def _draw_tracking(outcomes: list[Outcome], tracking: dict, folder: Path) -> Pat
                     [each["mean"] - each["low"] for each in found],
                     [each["high"] - each["mean"] for each in found],
                 ]
-                _bars(axis, k, means, ends, f"policy {key}")
+                _bars(axis, k, means, ends, f"policy {key}", 2 if sight == "blind" else 3)
             scripted = [o.driven[f"after/scripted/{sight}"]["mean"] for o in outcomes]
             axis.plot(range(len(outcomes)), scripted, "k_", ms=22, label="scripted after")
             axis.set_title("model alone" if sight == "blind" else "with cameras")
@@ -269,11 +269,13 @@ def _draw_tracking(outcomes: list[Outcome], tracking: dict, folder: Path) -> Pat
         return _saved(figure, folder / "hidden_tracking.png")
 
 
-def _bars(axis, k: int, heights, ends, label: str) -> None:
+def _bars(axis, k: int, heights, ends, label: str, decimals: int = 2) -> None:
     places = [place + 0.28 * (k - 1) for place in range(len(heights))]
     key = label.removeprefix("policy ")
-    bars = axis.bar(places, heights, 0.26, yerr=ends, color=COLOURS[key], label=label, capsize=2)
-    axis.bar_label(bars, fmt="%.2f", fontsize=7, padding=2)
+    axis.bar(places, heights, 0.26, yerr=ends, color=COLOURS[key], label=label, capsize=2)
+    for x, height in zip(places, heights, strict=True):  # at the foot, clear of the error bars
+        at = {"xytext": (0, 2), "textcoords": "offset points", "ha": "center"}
+        axis.annotate(f"{height:.{decimals}f}", (x, 0), **at, fontsize=6.5, color="white")
 
 
 def _name(axis, outcomes: list[Outcome]) -> None:

@@ -93,6 +93,14 @@ def _validation_config(validation: Validation) -> dict:
     return known if validation.rmse_mm is not None else {}
 
 
+def _interval(table: dict) -> dict:
+    """The interval of a config; earlier versions had one growth for all key points."""
+    growth, quantiles = table.get("growth"), table.get("quantiles_mm")
+    if isinstance(growth, int | float) and isinstance(quantiles, list) and quantiles:
+        return table | {"growth": [float(growth)] * len(quantiles[0])}
+    return table
+
+
 def _opened(
     folder: Path, name: str, facts: ArmFacts, arguments: dict, version: int | None
 ) -> Effect:
@@ -234,7 +242,7 @@ def load_model(
             name: _opened(folder, name, facts, arguments, versions.get(name))
             for name, arguments in config["effects"].items()
         }
-        stated = {"interval": config["interval"]} if config.get("interval") else {}
+        stated = {"interval": _interval(config["interval"])} if config.get("interval") else {}
         validation = from_table(Validation, config["validation"] | stated, Where(file))
         model = ArmModel(spec, NETWORKS[kind][0](low, high, **network), effects, None, validation)
         model.load_state_dict(weights)

@@ -7,13 +7,14 @@ each other, so that whole runs, or long blocks of time, are left out of the trai
 The score of key point k with the error e_k is that of locally weighted conformal prediction (Lei
 et al. 2018, sec. 5.2), with the distance d to the nearest actuation of the training as the scale:
 
-    s_k = e_k / (1 + growth d),    radius_k(level) = (1 + growth d) quantile_level(s_k).
+    s_k = e_k / (1 + growth_k d),    radius_k(level) = (1 + growth_k d) quantile_level(s_k).
 
 d is the Euclidean distance in actuation, each chamber in shares of its range. Far from the training
-data the interval widens with growth > 0. The most likely of `GROWTHS` is taken: the sizes of groups
-(see below) are log-normal, so it is that with the least variance of their logarithms. The growth is
-0 unless the sum of squares falls by more than one more parameter takes away by chance (F test at
-5 %, with 1 and K - 2 degrees of freedom).
+data the interval of a key point widens with its growth > 0. Each key point has its own: the tip may
+be off by more and more where one at the base is off by the noise of the cameras everywhere. The
+most likely of `GROWTHS` is taken: the sizes of groups (see below) are log-normal, so it is that
+with the least variance of their logarithms. The growth is 0 unless the sum of squares falls by more
+than one more parameter takes away by chance (F test at 5 %, with 1 and K - 2 degrees of freedom).
 
 A further run differs from all of those that were scored, so the quantile of few runs covers too
 little of it. Without an assumption on runs no finite radius is certain to hold a share `level` of
@@ -34,6 +35,7 @@ left out (the jackknife of Barber et al. 2021, by groups).
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
 import torch
@@ -76,8 +78,9 @@ class ErrorInterval:
     """Coverages, rising."""
     quantiles_mm: tuple[tuple[float, ...], ...]
     """For each coverage, the quantile of each key point's score, base to tip, mm."""
-    growth: float
-    """Growth of the radius by distance to the training data, per range of a chamber."""
+    growth: tuple[float, ...]
+    """Growth of each key point's radius by distance to the training data, per range of a
+    chamber."""
     rows: int
     """Number of rows whose errors were scored."""
     groups: int
@@ -93,7 +96,7 @@ class ErrorInterval:
         share outside; beyond them the nearest is taken.
         """
         quantile = distance.new_tensor(self._quantile(coverage))
-        return (1 + self.growth * distance).unsqueeze(-1) * quantile
+        return (1 + distance.unsqueeze(-1) * distance.new_tensor(self.growth)) * quantile
 
     def _quantile(self, coverage: float) -> list[float]:
         if coverage in self.levels:  # exactly, so that the rows that calibrated it are covered
@@ -109,9 +112,12 @@ class ErrorInterval:
             for a, b in zip(self.quantiles_mm[above - 1], self.quantiles_mm[above], strict=True)
         ]
 
-    def scaled(self, factor: float) -> "ErrorInterval":
-        """This interval with all radii times a factor."""
-        quantiles = tuple(tuple(factor * x for x in row) for row in self.quantiles_mm)
+    def scaled(self, factors: Sequence[float]) -> "ErrorInterval":
+        """This interval with the radii of each key point times a factor of its own."""
+        quantiles = tuple(
+            tuple(factor * x for factor, x in zip(factors, row, strict=True))
+            for row in self.quantiles_mm
+        )
         return replace(self, quantiles_mm=quantiles)
 
     def to_json(self) -> dict:
@@ -121,7 +127,11 @@ class ErrorInterval:
     def sentence(self) -> str:
         """The interval on a row like those of the training, in one line."""
         radii = " ".join(f"{value:.2f}" for value in self._quantile(LEVEL))
-        beyond = f"; wider by {self.growth:g} x distance to the training data" * (self.growth > 0)
+        beyond = ""
+        if any(self.growth):
+            each = self.growth[:1] if len(set(self.growth)) == 1 else self.growth
+            growth = " ".join(f"{value:g}" for value in each)
+            beyond = f"; wider by {growth} x distance to the training data"
         few = f"; fewer than {EXACT_GROUPS}, so it assumes log-normal sizes of their errors"
         if self.groups < LEAST_GROUPS:
             few = "; too few to know how much groups differ"
@@ -163,37 +173,41 @@ def calibrate(error: Tensor, distance: Tensor, group: Tensor, source: str) -> Er
     if int((~error.isnan()).sum(0).min()) < LEAST_ROWS:
         return None
     error, distance = error.double(), distance.double()
-    growth = _growth(error, distance, group)
-    scores = error / (1 + growth * distance)[:, None]
+    growth = [_growth(column[:, None], distance, group) for column in error.unbind(1)]
+    scores = error / (1 + distance[:, None] * error.new_tensor(growth))
+    fitted = [1 + (each > 0) for each in growth]
     widest, quantiles = torch.zeros_like(scores[0]), []
     for level in LEVELS:
-        widest = torch.maximum(widest, group_quantiles(scores, group, level, 1 + (growth > 0)))
+        widest = torch.maximum(widest, group_quantiles(scores, group, level, fitted))
         quantiles.append(tuple(widest.tolist()))
     return ErrorInterval(
         LEVELS,
         tuple(quantiles),
-        growth,
+        tuple(growth),
         len(error),
         len(group.unique()),
         source,
     )
 
 
-def group_quantiles(scores: Tensor, group: Tensor, level: float, fitted: int = 1) -> Tensor:
+def group_quantiles(
+    scores: Tensor, group: Tensor, level: float, fitted: Sequence[int] | None = None
+) -> Tensor:
     """(n,) scores that hold a share `level` of the rows of a further group.
 
     scores: (S, n), NaN where missing; group: (S,) number of the run or block of each row; fitted:
-    parameters that were fitted to the sizes of groups: their mean, and a growth. Of one group, or
-    of more than `MOST_GROUPS`, the quantiles of all rows.
+    for each key point the parameters that were fitted to the sizes of groups: their mean, and a
+    growth; None: the mean alone. Of one group, or of more than `MOST_GROUPS`, the quantiles of all
+    rows.
     """
     plain = _quantiles(scores, level)
     names, index = group.unique(return_inverse=True)
     if not 1 < len(names) <= MOST_GROUPS:
         return plain
     found = []
-    for column in scores.unbind(1):
+    for column, parameters in zip(scores.unbind(1), fitted or [1] * scores.shape[1], strict=True):
         seen = ~column.isnan()
-        of_further = _of_further_group(column[seen], index[seen], level, fitted)
+        of_further = _of_further_group(column[seen], index[seen], level, parameters)
         if of_further is None:
             return group_factor(scores, group, level) * plain
         found.append(of_further)
@@ -230,7 +244,7 @@ def _of_further_group(scores: Tensor, group: Tensor, level: float, fitted: int) 
 
 
 def _growth(error: Tensor, distance: Tensor, group: Tensor) -> float:
-    """Growth of the scores' scale by distance, 0 where the sizes of groups do not show any.
+    """Growth of the scale of scores (S,) by distance, 0 where the sizes of groups do not show any.
 
     Of fewer than `LEAST_GROUPS` groups: the one of least mean radius.
     """

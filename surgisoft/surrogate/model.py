@@ -294,7 +294,7 @@ class ArmModel(nn.Module):
         """Whether `predict_interval` knows how far off this model may be."""
         interval = self.validation.interval
         return interval is not None and (
-            interval.growth == 0 or self.training_residuals is not None
+            not any(interval.growth) or self.training_residuals is not None
         )
 
     @torch.no_grad()
@@ -313,7 +313,7 @@ class ArmModel(nn.Module):
             )
         interval, distance = self.validation.interval, torch.zeros_like(actuation[:, 0])
         assert interval is not None
-        if interval.growth > 0 and self.training_residuals is not None:
+        if any(interval.growth) and self.training_residuals is not None:
             span = torch.tensor(self.spec.span, dtype=actuation.dtype, device=actuation.device)
             reference = self.training_residuals.actuation.to(actuation)
             distance = distance_to(actuation, reference, span)

@@ -60,7 +60,7 @@ def test_the_coverage_of_the_models_interval_is_stated():
     points[:, 1] += [3.0, 4.0, 0.0]
     points[:2, 2, 2] += 12.0
     interval = ErrorInterval(
-        (0.5, 0.95), ((0.1,) * 3, (1.0, 6.0, 10.0)), 0.0, 9, 3, "held-out rows"
+        (0.5, 0.95), ((0.1,) * 3, (1.0, 6.0, 10.0)), (0.0,) * 3, 9, 3, "held-out rows"
     )
     model = still_model().replace(validation=Validation(1.0, interval=interval))
     result, _ = compare(model, [recording(points)])

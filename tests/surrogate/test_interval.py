@@ -41,7 +41,7 @@ def test_the_quantiles_of_gaussian_errors_are_those_of_the_chi_distribution():
     found = calibrate(gaussian(20000, 0), torch.zeros(20000), torch.arange(20000) // 100, "s")
     radius = found.radius_mm(torch.zeros(1, dtype=torch.float64))[0]
     assert radius.tolist() == pytest.approx([stats.chi(3).ppf(0.95) * k for k in (1, 3)], rel=0.02)
-    assert found.growth == 0.0, "distance explains nothing"
+    assert found.growth == (0.0, 0.0), "distance explains nothing"
     assert (found.rows, found.groups) == (20000, 200)
 
 
@@ -60,11 +60,12 @@ def test_the_interval_widens_where_errors_grow_with_distance():
     """Errors ten times as large at distance 1 than at 0: coverage holds at both ends."""
     far = torch.rand(8000, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     found = calibrate(gaussian(8000, 4, 1 + 10 * far), far, torch.zeros(8000), "s")
-    assert found.growth == pytest.approx(10.0)
+    assert min(found.growth) >= 3.0
+    assert found.growth[1] == 10.0
     for at in (0.05, 0.95):
         fresh = gaussian(3000, 5, torch.full((3000,), 1 + 10 * at, dtype=torch.float64))
         radius = found.radius_mm(torch.full((3000,), at, dtype=torch.float64))
-        assert coverage_of(fresh, radius) == pytest.approx(LEVEL, abs=0.02)
+        assert coverage_of(fresh, radius) == pytest.approx(LEVEL, abs=0.03)
 
 
 @given(
@@ -114,7 +115,7 @@ def test_the_size_of_a_further_run_follows_students_t(level, fitted):
     """Runs of constant errors: the predictive quantile of a normal sample in closed form."""
     size = torch.tensor([1.0, 2.0, 0.5, 3.0, 1.2], dtype=torch.float64)
     rows = size.repeat_interleave(50)[:, None]
-    found = group_quantiles(rows, torch.arange(250) // 50, level, fitted)
+    found = group_quantiles(rows, torch.arange(250) // 50, level, [fitted])
     log = size.log().numpy()
     wide = log.std(ddof=fitted) * math.sqrt(1 + 1 / 5)
     assert float(found) == pytest.approx(
@@ -133,21 +134,36 @@ def distances_of_runs(runs: int, seed: int, growth: float):
 
 def test_few_runs_show_no_growth_by_chance():
     """The errors have nothing to do with the distance, but six runs look as if they had."""
-    grown = [calibrate(*distances_of_runs(6, seed, 0.0), "s").growth > 0 for seed in range(40)]
-    assert sum(grown) <= 5
+    found = [calibrate(*distances_of_runs(6, seed, 0.0), "s").growth for seed in range(40)]
+    for grown in zip(*found, strict=True):
+        assert sum(growth > 0 for growth in grown) <= 5
 
 
 def test_a_growth_that_runs_agree_on_is_found():
-    grown = [calibrate(*distances_of_runs(16, seed, 10.0), "s").growth for seed in range(10)]
-    assert sum(growth >= 3 for growth in grown) >= 9
+    found = [calibrate(*distances_of_runs(16, seed, 10.0), "s").growth for seed in range(10)]
+    for grown in zip(*found, strict=True):
+        assert sum(growth >= 3 for growth in grown) >= 9
+
+
+def test_a_key_point_with_noise_alone_does_not_grow_with_the_others():
+    """The base is off by the noise of the cameras at any distance, the tip by more far away."""
+    error, far, group = distances_of_runs(16, 5, 30.0)
+    error[:, 0] = gaussian(len(error), 6)[:, 0]
+    found = calibrate(error, far, group, "s")
+    assert found.growth[0] == 0.0
+    assert found.growth[1] >= 10.0
+    fresh = gaussian(len(error), 7)[:, 0]
+    for at in (0.0, 1.0):
+        radius = found.radius_mm(torch.full((len(fresh),), at, dtype=torch.float64))[:, 0]
+        assert coverage_of(fresh, radius) == pytest.approx(LEVEL, abs=0.02)
 
 
 def test_a_fitted_growth_takes_a_degree_of_freedom():
     error, far, group = distances_of_runs(8, 3, 30.0)
     found = calibrate(error, far, group, "s")
-    assert found.growth > 0
-    scores = error / (1 + found.growth * far)[:, None]
-    expected = group_quantiles(scores, group, LEVEL, 2)
+    assert min(found.growth) > 0
+    scores = error / (1 + far[:, None] * torch.tensor(found.growth))
+    expected = group_quantiles(scores, group, LEVEL, (2, 2))
     assert found.quantiles_mm[found.levels.index(LEVEL)] == pytest.approx(expected.tolist())
 
 
@@ -176,7 +192,9 @@ def test_distance_is_in_ranges_of_the_chambers():
     assert found.tolist() == pytest.approx([0.0, math.hypot(0.3, 1.0)], abs=1e-6)
 
 
-INTERVAL = ErrorInterval((0.5, 0.95), ((0.1,) * 5, (0.4,) * 5), 2.0, 500, 7, "cross-validation")
+INTERVAL = ErrorInterval(
+    (0.5, 0.95), ((0.1,) * 5, (0.4,) * 5), (2.0,) * 5, 500, 7, "cross-validation"
+)
 
 
 @pytest.mark.parametrize(
@@ -201,6 +219,9 @@ def test_a_model_keeps_its_interval_in_its_folder(tmp_path):
     assert again.validation == stated
     config = json.loads((tmp_path / "arm" / "config.json").read_text())
     assert "interval" not in config["validation"], "earlier versions read that part whole"
+    config["interval"]["growth"] = 2.0
+    (tmp_path / "arm" / "config.json").write_text(json.dumps(config))
+    assert load_model(tmp_path / "arm").validation == stated, "one growth, of an earlier version"
 
 
 def test_models_of_earlier_versions_open_and_say_that_they_have_no_interval(tmp_path):

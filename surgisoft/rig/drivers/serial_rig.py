@@ -215,8 +215,8 @@ def open_motion_capture(text: str, host: str, clock) -> FrameReceiver:
         return FrameReceiver(listen(host, port), decode_json, about, clock)
     if kind == "natnet" and rest:
         server, _, given = rest.partition(":")
-        port = whole_number(given) if given else 0
-        if port is not None and (not given or 0 < port < 65536):
+        port = whole_number(given) or 0
+        if not given or 0 < port < 65536:
             return NatNetClient(server, port, host, clock=clock)
     raise InputError(
         f"rig 'serial': option 'mocap' is '{text}', expected udp:PORT or natnet:SERVER[:PORT]"

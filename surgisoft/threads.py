@@ -16,6 +16,8 @@ from itertools import pairwise
 
 import torch
 
+from surgisoft.workers import openblas_threads
+
 BLOCK = 512
 """Rows of a block (a count): the activations of a network of 128 neurons, 256 kB in float32, stay
 in the second cache of a core; `python benchmarks/threads.py --blocks 128,256,512,1024`."""
@@ -34,8 +36,8 @@ _pools: dict[int, ThreadPoolExecutor] = {}
 
 @contextmanager
 def rows_on_threads() -> Iterator[None]:
-    """Inside a block or a decorated function torch works on one thread, and `over_rows` on all that
-    torch had before.
+    """Inside a block or a decorated function torch and NumPy's OpenBLAS work on one thread, and
+    `over_rows` on all that torch had before.
 
     `torch.set_num_threads(1)` before it keeps all of it on the calling thread.
     """
@@ -46,7 +48,8 @@ def rows_on_threads() -> Iterator[None]:
     _rows.threads = before
     torch.set_num_threads(1)
     try:
-        yield
+        with openblas_threads(1):
+            yield
     finally:
         torch.set_num_threads(before)
         _rows.threads = 0

@@ -7,6 +7,7 @@ same files, and outlive the pool; Dask gives the work of a worker that was kille
 
 import contextlib
 import ctypes
+import functools
 import multiprocessing
 import multiprocessing.connection
 import os
@@ -71,32 +72,41 @@ def torch_threads(count: int) -> Iterator[None]:
     import torch
 
     before = torch.get_num_threads()
-    libraries = [(set_threads, get_threads()) for set_threads, get_threads in _openblas()]
     torch.set_num_threads(count)
+    try:
+        with openblas_threads(count):
+            yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextlib.contextmanager
+def openblas_threads(count: int) -> Iterator[None]:
+    """Set the number of threads of each OpenBLAS, that of NumPy and that of SciPy."""
+    loaded = [_openblas(module) for module in LINKED_TO_OPENBLAS if module in sys.modules]
+    libraries = [(each[0], each[1]()) for each in loaded if each is not None]
     for set_threads, _ in libraries:
         set_threads(count)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
         for set_threads, own in libraries:
             set_threads(own)
 
 
-def _openblas() -> Iterator[tuple[Callable[[int], object], Callable[[], int]]]:
-    """What sets and what gives the number of threads, of each OpenBLAS that is loaded.
+@functools.cache
+def _openblas(module: str) -> tuple[Callable[[int], object], Callable[[], int]] | None:
+    """What sets and what gives the number of threads of the OpenBLAS that a module is linked to.
 
-    NumPy and SciPy from their wheels have one each, whose functions are found through a module that
-    is linked to it. Other builds, such as those with MKL, have no such functions.
+    NumPy and SciPy from their wheels have one each. Other builds, such as those with MKL, have no
+    such functions.
     """
-    for module, suffix in LINKED_TO_OPENBLAS.items():
-        if module not in sys.modules:
-            continue
-        library = ctypes.CDLL(sys.modules[module].__file__)
-        with contextlib.suppress(AttributeError):
-            set_threads = getattr(library, f"scipy_openblas_set_num_threads{suffix}")
-            get_threads = getattr(library, f"scipy_openblas_get_num_threads{suffix}")
-            yield set_threads, get_threads
+    library, suffix = ctypes.CDLL(sys.modules[module].__file__), LINKED_TO_OPENBLAS[module]
+    try:
+        set_threads = getattr(library, f"scipy_openblas_set_num_threads{suffix}")
+        return set_threads, getattr(library, f"scipy_openblas_get_num_threads{suffix}")
+    except AttributeError:
+        return None
 
 
 @contextlib.contextmanager

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
-import numpy as np
-import torch
 from rsl_rl.models import MLPModel
 from rsl_rl.modules.distribution import GaussianDistribution
 from torch import Tensor, nn
 
+from surgisoft.agents.compiled_network import CompiledNetwork
 from surgisoft.agents.presets import Preset
-from surgisoft.compiled import compiled
 
 LOG_2_PI = math.log(2.0 * math.pi)
 
@@ -78,90 +75,11 @@ def acting(actor: MLPModel) -> nn.Module:
     What is evaluated during a training is then what the saved policy computes, to the last bit.
     """
     network = actor.as_jit()
-    _exchange_activations(network.mlp, CompiledTanh, nn.Tanh)
+    network.mlp = nn.Sequential(*network.mlp)
     return network
 
 
-# The hyperbolic tangent ----------------------------------------------------------------------
-
-PADE = 12
-"""Order of the Pade approximant of exp(2 x) that the compiled tanh takes: within 5e-8 of tanh up
-to `SATURATED`, which is less than the rounding of float32 there."""
-LEAST_COMPILED = 1 << 14
-"""Fewest numbers for which a call of the compiled loop, 10 to 30 us, costs less than it saves."""
-SATURATED = np.float32(9.2)
-"""Argument beyond which tanh is 1 in float32."""
-_TERMS = [
-    math.comb(PADE, k) * math.factorial(2 * PADE - k) * 2.0**k / math.factorial(2 * PADE)
-    for k in range(PADE + 1)
-]
-ODD = np.array(_TERMS[1::2][::-1], np.float32)
-EVEN = np.array(_TERMS[0::2][::-1], np.float32)
-"""Terms of odd and of even powers of the approximant's numerator, the highest first: with N(x) its
-numerator exp(2 x) is N(x) / N(-x) and tanh x is N's odd part over its even part (Pade 1892)."""
-
-
-@compiled
-def _tanh(x, out):
-    """tanh of x (N,) into out (N,)."""
-    for i in range(len(x)):
-        value = x[i]
-        value = SATURATED if value > SATURATED else value
-        value = -SATURATED if value < -SATURATED else value
-        square = value * value
-        above, below = ODD[0], EVEN[0]
-        for k in range(1, len(ODD)):
-            above = above * square + ODD[k]
-        for k in range(1, len(EVEN)):
-            below = below * square + EVEN[k]
-        out[i] = value * above / below
-
-
-def _compiled_tanh(x: Tensor) -> Tensor:
-    x = x.detach().contiguous()
-    out = torch.empty_like(x)
-    _tanh(x.view(-1).numpy(), out.view(-1).numpy())
-    return out
-
-
-class _TanhFunction(torch.autograd.Function):
-    """tanh with the derivative 1 - tanh^2."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor) -> Tensor:
-        out = _compiled_tanh(x)
-        ctx.save_for_backward(out)
-        return out
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
-        return torch.ops.aten.tanh_backward(gradients[0], ctx.saved_tensors[0])
-
-
-class CompiledTanh(nn.Tanh):
-    """A compiled hyperbolic tangent that replaces PyTorch's on a processor.
-
-    It takes a tenth of the time of PyTorch's, which was a fifth of an update of PPO, and is within
-    1e-6 of tanh. For few numbers, on other devices and in other types than float32 PyTorch's own
-    is called.
-    """
-
-    def forward(self, input: Tensor) -> Tensor:  # noqa: A002  # nn.Tanh names it so
-        """The hyperbolic tangent of numbers of any shape, in that shape."""
-        plain = input.device.type == "cpu" and input.dtype == torch.float32
-        if not plain or input.numel() < LEAST_COMPILED:
-            return super().forward(input)
-        if torch.is_grad_enabled() and input.requires_grad:
-            return _TanhFunction.apply(input)
-        return _compiled_tanh(input)
-
-
-def compile_activations(network: MLPModel) -> None:
-    """Let an actor or critic that is trained on a processor compute tanh by `CompiledTanh`."""
-    _exchange_activations(network.mlp, nn.Tanh, CompiledTanh)
-
-
-def _exchange_activations(layers: nn.Sequential, old: type[nn.Module], new: type[nn.Tanh]) -> None:
-    for place, layer in enumerate(layers):
-        if type(layer) is old:
-            layers[place] = new()
+def compile_network(network: MLPModel) -> None:
+    """Let an actor or critic that is trained compute by `CompiledNetwork`, where it has tanh."""
+    if CompiledNetwork.fits(network.mlp):
+        network.mlp = CompiledNetwork(*network.mlp)

@@ -23,8 +23,13 @@ from rsl_rl.algorithms import PPO
 from tensordict import TensorDict
 from torch import Tensor
 
+from surgisoft.agents.compiled_network import CompiledNetwork
 from surgisoft.agents.distributed import Processes
-from surgisoft.agents.policy_network import compile_activations, network_config, noise_config
+from surgisoft.agents.policy_network import (
+    compile_network,
+    network_config,
+    noise_config,
+)
 from surgisoft.agents.presets import Preset
 from surgisoft.agents.vec_env import STATE, JointEnv
 from surgisoft.threads import rows_on_threads
@@ -45,7 +50,7 @@ def algorithm_config(agent: str, preset: Preset, processes: Processes, critic: s
         },
         "critic": {"class_name": "MLPModel", **network_config(preset)},
         "algorithm": {
-            "class_name": "PPO",
+            "class_name": class_of(processes),
             "num_learning_epochs": preset.epochs,
             "num_mini_batches": preset.batches,
             "gamma": preset.gamma,
@@ -68,6 +73,75 @@ def groups_of(agent: str, agents: Collection[str], privileged: bool = False) -> 
     return (agent, STATE) if len(agents) > 1 or privileged else (agent,)
 
 
+def class_of(processes: Processes) -> type[PPO]:
+    """The class of a process's agents."""
+    return SharedPPO if processes.count > 1 else PPO
+
+
+LEAST_RATE, MOST_RATE = 1e-5, 1e-2
+"""Bounds of the adapted learning rate, those of rsl-rl."""
+RATE_FACTOR = 1.5
+"""By which the learning rate is changed, that of rsl-rl."""
+
+
+class SharedPPO(PPO):
+    """rsl-rl's PPO for several processes that talk once in a minibatch in place of three times.
+
+    rsl-rl exchanges the divergence that the learning rate is adapted to, then the learning rate,
+    then the gradients. Every exchange is a wait of both processes, after which a processor's caches
+    are cold. Here the divergence goes with the gradients, and each process adapts the learning rate
+    by the same rule to the same number; the values are those of rsl-rl.
+    """
+
+    schedule: str
+    learning_rate: float
+    adapts = False
+    """Whether the learning rate is adapted; rsl-rl's own `schedule` is `fixed` then."""
+    batch: Any = None
+    """The minibatch of the present update."""
+
+    def talk_once(self) -> None:
+        """Take over the adaptation of the learning rate from rsl-rl's update."""
+        self.adapts = self.desired_kl is not None and self.schedule == "adaptive"
+        self.schedule = "fixed"
+        generator = self.storage.mini_batch_generator
+
+        def noted(batches: int, epochs: int) -> Iterator[Any]:
+            for batch in generator(batches, epochs):
+                self.batch = batch
+                yield batch
+
+        self.storage.mini_batch_generator = noted
+
+    def reduce_parameters(self) -> None:
+        """Average gradients and divergence over the processes, and adapt the learning rate."""
+        parameters = [*self.actor.parameters(), *self.critic.parameters()]
+        gradients = [each.grad for each in parameters if each.grad is not None]
+        parts = [each.view(-1) for each in gradients]
+        with torch.no_grad():
+            if self.adapts:
+                present = tuple(each.detach() for each in self.actor.output_distribution_params)
+                old = self.batch.old_distribution_params
+                parts.append(self.actor.get_kl_divergence(old, present).mean().view(1))
+            packed = torch.cat(parts)
+            torch.distributed.all_reduce(packed, op=torch.distributed.ReduceOp.SUM)
+            packed /= self.gpu_world_size
+            found = packed.split([each.numel() for each in parts])
+            for gradient, value in zip(gradients, found, strict=False):
+                gradient.copy_(value.view_as(gradient))
+        if self.adapts:
+            self._adapt(found[-1].item())
+
+    def _adapt(self, divergence: float) -> None:
+        if divergence > 2.0 * self.desired_kl:
+            self.learning_rate = max(LEAST_RATE, self.learning_rate / RATE_FACTOR)
+        elif 0.0 < divergence < self.desired_kl / 2.0:
+            self.learning_rate = min(MOST_RATE, self.learning_rate * RATE_FACTOR)
+        self.learning_rate = torch.tensor(self.learning_rate).item()  # in float32, as exchanged
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.learning_rate
+
+
 def make_ppo(env: JointEnv, preset: Preset, processes: Processes) -> dict[str, PPO]:
     """One PPO for each agent: an actor on its observation, a critic on the joint state."""
     seen, by_agent, device = env.get_observations().clone(), {}, env.task.world.device
@@ -84,12 +158,14 @@ def make_ppo(env: JointEnv, preset: Preset, processes: Processes) -> dict[str, P
             ppo.get_policy().mlp[-1].weight.mul_(0.01)
             ppo.get_policy().mlp[-1].bias.zero_()
         for network in (ppo.actor, ppo.critic):
-            compile_activations(network)
+            compile_network(network)
         for group in ppo.optimizer.param_groups:
             # One call for all weights instead of a dozen small ones for each.
             group["fused"] = True
         each = ppo.storage.mini_batch_generator
         ppo.storage.mini_batch_generator = functools.partial(gathered_once, each)
+        if isinstance(ppo, SharedPPO):
+            ppo.talk_once()
         ppo.train_mode()
         by_agent[agent] = ppo
     return by_agent
@@ -115,6 +191,18 @@ def set_noise(ppo: PPO, preset: Preset, progress: float) -> None:
         first, last = math.log(preset.noise), math.log(preset.last_noise)
         with torch.no_grad():
             ppo.get_policy().distribution.log_std_param.fill_(first + progress * (last - first))
+
+
+def update(ppo: PPO) -> dict[str, float]:
+    """rsl-rl's update of an agent from its rollout; the means of its losses.
+
+    Compiled networks divide the rows among the threads of torch, which others use themselves.
+    """
+    networks = (ppo.get_policy(), ppo.critic)
+    if all(isinstance(each.mlp, CompiledNetwork) for each in networks):
+        with rows_on_threads():
+            return ppo.update()
+    return ppo.update()
 
 
 @dataclass(frozen=True, eq=False)

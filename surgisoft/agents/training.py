@@ -26,7 +26,7 @@ from surgisoft.agents.distributed import Processes
 from surgisoft.agents.learned import ActorPolicy, agent_sizes, check_weights
 from surgisoft.agents.loggers import TENSORBOARD, LoggerFailed, open_writer
 from surgisoft.agents.policy_network import acting
-from surgisoft.agents.ppo import RolloutMeans, collect_rollout, make_ppo, set_noise
+from surgisoft.agents.ppo import RolloutMeans, collect_rollout, make_ppo, set_noise, update
 from surgisoft.agents.presets import Plan
 from surgisoft.agents.run_folder import BEST, LAST, RunFolder, create_run, damaged
 from surgisoft.agents.selection import evaluate_checkpoint, is_better
@@ -119,7 +119,7 @@ class Training:
         self.seen, gathered = collect_rollout(self.env, self.agents, self.seen, preset.rollout)
         losses = {}
         for agent, ppo in self.agents.items():
-            for name, value in ppo.update().items():
+            for name, value in update(ppo).items():
                 losses[f"{agent}/{name}"] = value
         self.iteration += 1
         self.clock.tick()

@@ -1,7 +1,5 @@
 """Drivers by name, and what they promise."""
 
-import math
-
 import pytest
 import torch
 from rsl_rl.models import MLPModel
@@ -9,13 +7,12 @@ from tensordict import TensorDict
 from torch.distributions import Normal, kl_divergence
 
 from surgisoft.agents.actor import Actor, ScaledActor
+from surgisoft.agents.compiled_network import LEAST_ROWS, CompiledNetwork
 from surgisoft.agents.policies import Random, open_policy
 from surgisoft.agents.policy_network import (
-    LEAST_COMPILED,
     ActionNoise,
-    CompiledTanh,
     acting,
-    compile_activations,
+    compile_network,
     network_config,
     noise_config,
 )
@@ -106,26 +103,12 @@ def test_a_saved_policy_acts_as_rsl_rl_says_to_the_last_bit(activation, normalis
     assert expected.std() > 1e-3
 
 
-def test_compiled_tanh_is_tanh_and_so_is_its_gradient():
-    x = torch.linspace(-12.0, 12.0, LEAST_COMPILED, requires_grad=True)
-    y = CompiledTanh()(x)
-    (slope,) = torch.autograd.grad(y.sum(), x)
-    truth = x.detach().double().tanh()
-    assert (y.detach() - truth).abs().max() < 1e-6
-    assert (slope - (1.0 - truth.square())).abs().max() < 2e-6
-    odd = torch.tensor([math.nan, math.inf, -math.inf, 0.0, 1e-30]).repeat(LEAST_COMPILED)
-    found = CompiledTanh()(odd)[:5]
-    assert torch.allclose(found[1:], odd[1:5].tanh(), rtol=1e-6, atol=0.0)
-    assert found[0].isnan()
-
-
-def test_a_training_computes_every_tanh_by_the_compiled_one(task):
+def test_a_training_computes_by_compiled_networks_and_its_policies_act_as_saved_ones():
     actor = trained_by_rsl_rl(5, 3, Preset(hidden=(8, 8)))
-    batch = LEAST_COMPILED // 8
-    seen = torch.randn(batch, 5, generator=torch.Generator().manual_seed(0))
+    seen = torch.randn(LEAST_ROWS, 5, generator=torch.Generator().manual_seed(0))
     before, names = actor.mlp(seen), list(actor.state_dict())
-    compile_activations(actor)
-    assert [type(layer) for layer in actor.mlp].count(CompiledTanh) == 2
+    compile_network(actor)
+    assert isinstance(actor.mlp, CompiledNetwork)
     assert list(actor.state_dict()) == names
     assert torch.allclose(actor.mlp(seen), before, atol=1e-5)
     assert torch.equal(acting(actor)(seen), before)

@@ -9,11 +9,18 @@ from dataclasses import replace
 
 import pytest
 import torch
+from rsl_rl.algorithms import PPO
 
 from surgisoft.agents.distributed import Processes
 from surgisoft.agents.learned import LearnedPolicy
 from surgisoft.agents.policies import Random
-from surgisoft.agents.ppo import algorithm_config, collect_rollout, make_ppo, set_noise
+from surgisoft.agents.ppo import (
+    SharedPPO,
+    algorithm_config,
+    collect_rollout,
+    make_ppo,
+    set_noise,
+)
 from surgisoft.agents.presets import PRESETS, Plan, Preset, config_for, envs_for, preset_for
 from surgisoft.agents.run_folder import BEST, LAST, RunFolder
 from surgisoft.agents.selection import SEED, evaluate_checkpoint, is_better
@@ -502,3 +509,43 @@ def test_a_short_training_keeps_its_updates_by_fewer_episodes(steps, envs):
 
 def test_a_training_by_the_clock_has_the_usual_episodes():
     assert TrainingRequest("track_circle", minutes=1.0).plan().preset.envs == 1024
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+@pytest.mark.parametrize("desired_kl", [0.01, 1e-5, None])
+def test_processes_that_talk_once_learn_as_rsl_rl_does(rank, desired_kl, monkeypatch):
+    """Two processes that see the same, in place of which every sum is twice this one's part."""
+    reductions = []
+
+    def all_reduce(tensor, op):
+        reductions.append(tensor.numel())
+        tensor.mul_(2.0)
+
+    monkeypatch.setattr(torch.distributed, "all_reduce", all_reduce)
+    monkeypatch.setattr(torch.distributed, "broadcast", lambda tensor, src: None)
+    preset = replace(TINY, desired_kl=desired_kl, last_noise=None)
+    found = []
+    for number, kind in ((0, PPO), (rank, SharedPPO)):
+        torch.manual_seed(0)
+        env = JointEnv(make_task("track_circle"), preset.envs, 0, preset.action_kPa)
+        processes = Processes(number, 2)
+        monkeypatch.setattr("surgisoft.agents.ppo.class_of", lambda _, kind=kind: kind)
+        agents = make_ppo(env, preset, processes)
+        (ppo,) = agents.values()
+        assert type(ppo) is kind
+        seen, rates = env.get_observations(), []
+        for _ in range(3):
+            seen, _ = collect_rollout(env, agents, seen, preset.rollout)
+            reductions.clear()
+            ppo.update()
+            rates.append(ppo.learning_rate)
+        weights = [
+            each.detach().clone() for each in (*ppo.actor.parameters(), *ppo.critic.parameters())
+        ]
+        assert all(group["lr"] == rates[-1] for group in ppo.optimizer.param_groups)
+        found.append((rates, weights, len(reductions)))
+    (rates, weights, _), (shared_rates, shared_weights, exchanges) = found
+    assert shared_rates == rates
+    assert (len(set(rates)) > 1) == (desired_kl is not None)
+    assert all(map(torch.equal, weights, shared_weights))
+    assert exchanges == preset.epochs * preset.batches

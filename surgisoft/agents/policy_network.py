@@ -12,6 +12,9 @@ from surgisoft.agents.compiled_network import CompiledNetwork
 from surgisoft.agents.presets import Preset
 
 LOG_2_PI = math.log(2.0 * math.pi)
+SAME = 1e-9
+"""Largest divergence of a policy from itself: products of a row are rounded by the batch that it is
+in, which makes up to 2e-12. One step of Adam makes 1e-5 and more."""
 
 
 def network_config(preset: Preset) -> dict:
@@ -33,6 +36,30 @@ def noise_config(preset: Preset) -> dict:
     }
 
 
+def log_likelihood(outputs: Tensor, mean: Tensor, deviation: Tensor) -> Tensor:
+    """(B,) log-likelihood of outputs (B, m) under Gaussians with means (B, m), deviations (m,)."""
+    square = ((outputs - mean) / deviation).square().sum(dim=-1)
+    return -0.5 * square - (deviation.log() + 0.5 * LOG_2_PI).sum()
+
+
+def entropy(deviation: Tensor) -> Tensor:
+    """Entropy of a Gaussian with deviations (m,)."""
+    return (deviation.log() + 0.5 * (1.0 + LOG_2_PI)).sum()
+
+
+def divergence(old_mean: Tensor, old: Tensor, new_mean: Tensor, new: Tensor) -> Tensor:
+    """(B,) Kullback-Leibler divergence of old from new Gaussians; zero where they are the same.
+
+    rsl-rl leaves the learning rate as it is where the mean divergence is zero, as in the first
+    minibatch of an update. Means are (B, m); the deviations, (m,) or (1, m), are the same in all
+    rows, because parameters stay while a rollout is collected.
+    """
+    ratio = (old / new).square()
+    apart = ((old_mean - new_mean) / new).square().sum(dim=-1)
+    found = 0.5 * (apart + (ratio - 1.0 - ratio.log()).sum())
+    return found.where(found.mean() > SAME, 0.0)
+
+
 class ActionNoise(GaussianDistribution):
     """Gaussian actions whose deviation is one for all rows: rsl-rl's, with fewer operations.
 
@@ -40,33 +67,25 @@ class ActionNoise(GaussianDistribution):
     likelihood, for the entropy and for the divergence of every minibatch.
     """
 
-    def _deviation(self) -> Tensor:
+    def deviation(self) -> Tensor:
         """(m,) standard deviations of the present parameters."""
         return self.log_std_param.clamp(*self.log_std_range).exp()
 
     def log_prob(self, outputs: Tensor) -> Tensor:
         """(B,) log-likelihood of outputs (B, m)."""
-        deviation = self._deviation()
-        square = ((outputs - self.mean) / deviation).square().sum(dim=-1)
-        return -0.5 * square - (deviation.log() + 0.5 * LOG_2_PI).sum()
+        return log_likelihood(outputs, self.mean, self.deviation())
 
     @property
     def entropy(self) -> Tensor:
         """(B,) entropy, in every row the same."""
-        one = (self._deviation().log() + 0.5 * (1.0 + LOG_2_PI)).sum()
-        return one.expand(self.mean.shape[:-1])
+        return entropy(self.deviation()).expand(self.mean.shape[:-1])
 
     def kl_divergence(
         self, old_params: tuple[Tensor, ...], new_params: tuple[Tensor, ...]
     ) -> Tensor:
-        """(B,) Kullback-Leibler divergence of old from new means (B, m) and deviations (B, m).
-
-        The deviation is the same in all rows, because parameters stay while a rollout is collected.
-        """
+        """(B,) Kullback-Leibler divergence of old from new means (B, m) and deviations (B, m)."""
         (old_mean, old), (new_mean, new) = old_params, new_params
-        ratio = (old[:1] / new[:1]).square()
-        apart = ((old_mean - new_mean) / new[:1]).square().sum(dim=-1)
-        return 0.5 * (apart + (ratio - 1.0 - ratio.log()).sum())
+        return divergence(old_mean, old[:1], new_mean, new[:1])
 
 
 def acting(actor: MLPModel) -> nn.Module:

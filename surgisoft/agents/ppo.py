@@ -24,6 +24,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from surgisoft.agents.compiled_network import CompiledNetwork
+from surgisoft.agents.compiled_update import compiled_update
 from surgisoft.agents.distributed import Processes
 from surgisoft.agents.policy_network import (
     compile_network,
@@ -31,6 +32,7 @@ from surgisoft.agents.policy_network import (
     noise_config,
 )
 from surgisoft.agents.presets import Preset
+from surgisoft.agents.shared_ppo import SharedPPO
 from surgisoft.agents.vec_env import STATE, JointEnv
 from surgisoft.threads import rows_on_threads
 
@@ -78,70 +80,6 @@ def class_of(processes: Processes) -> type[PPO]:
     return SharedPPO if processes.count > 1 else PPO
 
 
-LEAST_RATE, MOST_RATE = 1e-5, 1e-2
-"""Bounds of the adapted learning rate, those of rsl-rl."""
-RATE_FACTOR = 1.5
-"""By which the learning rate is changed, that of rsl-rl."""
-
-
-class SharedPPO(PPO):
-    """rsl-rl's PPO for several processes that talk once in a minibatch in place of three times.
-
-    rsl-rl exchanges the divergence that the learning rate is adapted to, then the learning rate,
-    then the gradients. Every exchange is a wait of both processes, after which a processor's caches
-    are cold. Here the divergence goes with the gradients, and each process adapts the learning rate
-    by the same rule to the same number; the values are those of rsl-rl.
-    """
-
-    schedule: str
-    learning_rate: float
-    adapts = False
-    """Whether the learning rate is adapted; rsl-rl's own `schedule` is `fixed` then."""
-    batch: Any = None
-    """The minibatch of the present update."""
-
-    def talk_once(self) -> None:
-        """Take over the adaptation of the learning rate from rsl-rl's update."""
-        self.adapts = self.desired_kl is not None and self.schedule == "adaptive"
-        self.schedule = "fixed"
-        generator = self.storage.mini_batch_generator
-
-        def noted(batches: int, epochs: int) -> Iterator[Any]:
-            for batch in generator(batches, epochs):
-                self.batch = batch
-                yield batch
-
-        self.storage.mini_batch_generator = noted
-
-    def reduce_parameters(self) -> None:
-        """Average gradients and divergence over the processes, and adapt the learning rate."""
-        parameters = [*self.actor.parameters(), *self.critic.parameters()]
-        gradients = [each.grad for each in parameters if each.grad is not None]
-        parts = [each.view(-1) for each in gradients]
-        with torch.no_grad():
-            if self.adapts:
-                present = tuple(each.detach() for each in self.actor.output_distribution_params)
-                old = self.batch.old_distribution_params
-                parts.append(self.actor.get_kl_divergence(old, present).mean().view(1))
-            packed = torch.cat(parts)
-            torch.distributed.all_reduce(packed, op=torch.distributed.ReduceOp.SUM)
-            packed /= self.gpu_world_size
-            found = packed.split([each.numel() for each in parts])
-            for gradient, value in zip(gradients, found, strict=False):
-                gradient.copy_(value.view_as(gradient))
-        if self.adapts:
-            self._adapt(found[-1].item())
-
-    def _adapt(self, divergence: float) -> None:
-        if divergence > 2.0 * self.desired_kl:
-            self.learning_rate = max(LEAST_RATE, self.learning_rate / RATE_FACTOR)
-        elif 0.0 < divergence < self.desired_kl / 2.0:
-            self.learning_rate = min(MOST_RATE, self.learning_rate * RATE_FACTOR)
-        self.learning_rate = torch.tensor(self.learning_rate).item()  # in float32, as exchanged
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.learning_rate
-
-
 def make_ppo(env: JointEnv, preset: Preset, processes: Processes) -> dict[str, PPO]:
     """One PPO for each agent: an actor on its observation, a critic on the joint state."""
     seen, by_agent, device = env.get_observations().clone(), {}, env.task.world.device
@@ -166,6 +104,8 @@ def make_ppo(env: JointEnv, preset: Preset, processes: Processes) -> dict[str, P
         ppo.storage.mini_batch_generator = functools.partial(gathered_once, each)
         if isinstance(ppo, SharedPPO):
             ppo.talk_once()
+        if preset.compile:
+            ppo.update = compiled_update(ppo)
         ppo.train_mode()
         by_agent[agent] = ppo
     return by_agent

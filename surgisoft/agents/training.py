@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from surgisoft.agents.actor import ScaledActor
+from surgisoft.agents.compiled_update import CompileFailed, compile_arms
 from surgisoft.agents.distributed import Processes
 from surgisoft.agents.learned import ActorPolicy, agent_sizes, check_weights
 from surgisoft.agents.loggers import TENSORBOARD, LoggerFailed, open_writer
@@ -89,6 +90,8 @@ class Training:
         given = (plan.seed, preset.action_kPa, rank * _FAR, preset.privileged)
         self.env = JointEnv(task, preset.envs, *given)
         self.agents = make_ppo(self.env, preset, processes)
+        if preset.compile and task.world.device.type == "cuda":
+            compile_arms(task.world, preset.envs)
         if processes.count > 1:
             torch.manual_seed(plan.seed + rank * _FAR)
             for ppo in self.agents.values():
@@ -267,7 +270,7 @@ def train_new(
     # Everything is read back from the folder, so that resuming finds the same.
     try:
         return _continue(RunFolder(folder), processes, device, report, logger)
-    except LoggerFailed:  # before the first step: nothing is lost with the folder
+    except (LoggerFailed, CompileFailed):  # before an update: nothing is lost with the folder
         shutil.rmtree(folder)
         raise
 

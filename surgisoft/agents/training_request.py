@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from surgisoft.agents.compiled_update import check_compiler
 from surgisoft.agents.distributed import processes
 from surgisoft.agents.loggers import TENSORBOARD, check_logger
 from surgisoft.agents.presets import Plan, Preset, config_for, envs_for, preset_for, steps_for
@@ -36,6 +37,8 @@ class TrainingRequest:
     """Time to train in place of steps, minutes."""
     envs: int | None = None
     """Episodes side by side; None: the preset's, and fewer in a short training."""
+    compile: bool = False
+    """Whether `torch.compile` builds the loss of an update, and on CUDA the arms' step."""
     seed: int = 0
     """Seed of weights, noise and episodes."""
     target_error: float | None = None
@@ -62,7 +65,7 @@ class TrainingRequest:
         envs = self.envs
         if envs is None and self.steps is not None:
             envs = envs_for(self.preset, self.task, self.steps)
-        numbers = preset_for(self.preset, self.task, envs=envs)
+        numbers = preset_for(self.preset, self.task, envs=envs, compile=self.compile or None)
         if self.ppo:
             changed = merged(to_table(numbers), self.ppo)
             numbers = from_table(Preset, changed, Where(COMMAND_LINE, keys=("ppo",)))
@@ -137,6 +140,8 @@ def train(
             on_plan(plan)
     check_logger(logger)
     with torch_threads(threads), processes(device) as (here, kind):
+        if plan is not None and plan.preset.compile:
+            check_compiler(kind)
         if plan is None:
             result = resume(folder, here, kind, report, logger)
         else:

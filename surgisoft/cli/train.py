@@ -150,6 +150,14 @@ def train(
     device: Annotated[
         str, typer.Option(metavar="cpu|cuda", help="Device of simulation and training.")
     ] = "cpu",
+    compile_update: Annotated[
+        bool,
+        typer.Option(
+            "--compile",
+            help="Build the loss of an update by torch.compile, which needs a C++ compiler, on "
+            "CUDA Triton; worth it for few --envs (docs/train.md).",
+        ),
+    ] = False,
     logger: Annotated[
         str,
         typer.Option(
@@ -173,6 +181,7 @@ def train(
     given = {
         "preset": preset, "steps": steps, "minutes": minutes, "envs": envs, "seed": seed,
         "target_error": target_error, "arm": arm, "scene": scene, "config": config,
+        "compile": compile_update or None,
     }  # fmt: skip
     task = _assigned(changes or [], task, given)
     with progress(f"train {resume or output or task}") as report:

@@ -11,20 +11,22 @@ import pytest
 import torch
 from rsl_rl.algorithms import PPO
 
+from surgisoft.agents.compiled_network import CompiledNetwork
 from surgisoft.agents.distributed import Processes
 from surgisoft.agents.learned import LearnedPolicy
 from surgisoft.agents.policies import Random
 from surgisoft.agents.ppo import (
-    SharedPPO,
     algorithm_config,
     collect_rollout,
     make_ppo,
     set_noise,
+    update,
 )
 from surgisoft.agents.presets import PRESETS, Plan, Preset, config_for, envs_for, preset_for
 from surgisoft.agents.run_folder import BEST, LAST, RunFolder
 from surgisoft.agents.selection import SEED, evaluate_checkpoint, is_better
 from surgisoft.agents.session import EvaluationRequest
+from surgisoft.agents.shared_ppo import SharedPPO
 from surgisoft.agents.training import Training, resume, train_new
 from surgisoft.agents.training_request import TrainingRequest
 from surgisoft.agents.vec_env import STATE, JointEnv
@@ -549,3 +551,27 @@ def test_processes_that_talk_once_learn_as_rsl_rl_does(rank, desired_kl, monkeyp
     assert (len(set(rates)) > 1) == (desired_kl is not None)
     assert all(map(torch.equal, weights, shared_weights))
     assert exchanges == preset.epochs * preset.batches
+
+
+def test_compiled_networks_learn_at_the_rates_of_plain_layers(monkeypatch):
+    """A policy is at no distance from itself, although a row's sums depend on its batch."""
+    preset = replace(TINY, envs=300, batches=3, desired_kl=1e-3)
+    found = []
+    for plain in (False, True):
+        if plain:
+            monkeypatch.setattr("surgisoft.agents.ppo.compile_network", lambda network: None)
+        torch.manual_seed(0)
+        env = JointEnv(make_task("track_circle"), preset.envs, 0, preset.action_kPa)
+        agents = make_ppo(env, preset, Processes())
+        (ppo,) = agents.values()
+        assert isinstance(ppo.actor.mlp, CompiledNetwork) is not plain
+        seen, rates = env.get_observations(), []
+        for _ in range(3):
+            seen, _ = collect_rollout(env, agents, seen, preset.rollout)
+            update(ppo)
+            rates.append(ppo.learning_rate)
+        found.append((rates, [each.detach().clone() for each in ppo.actor.parameters()]))
+    assert found[0][0] == found[1][0]
+    assert len(set(found[0][0])) > 1
+    for one, other in zip(found[0][1], found[1][1], strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-4)

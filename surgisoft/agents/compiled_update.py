@@ -1,0 +1,176 @@
+"""PPO's update through `torch.compile`: the loss of a minibatch, forward and backward, as kernels.
+
+On a CPU inductor writes C++ for it. On CUDA it writes kernels that are recorded in CUDA graphs, so
+that a minibatch is a few launches in place of some two hundred.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from importlib.util import find_spec
+from typing import Any, cast
+
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from torch import Tensor, nn
+
+from surgisoft.agents.policy_network import ActionNoise, divergence, entropy, log_likelihood
+from surgisoft.agents.shared_ppo import SharedPPO, adapt_rate, adapts_rate
+from surgisoft.errors import InputError
+from surgisoft.graphs import reason_of
+from surgisoft.tasks.world.world import World
+
+
+class CompileFailed(InputError):
+    """`torch.compile` did not build the first minibatch; nothing was learned before."""
+
+
+COMPILERS = ("g++", "clang++", "c++")
+"""C++ compilers by which a machine can build what inductor writes for a CPU."""
+
+
+def check_compiler(device: torch.device) -> None:
+    """Raise InputError where this machine has not what `torch.compile` needs for a device."""
+    if device.type == "cuda":
+        if find_spec("triton") is None:
+            raise InputError("--compile: needs Triton on CUDA; pip install triton, or leave it out")
+        return
+    named = os.environ.get("CXX")
+    if not any(map(shutil.which, (named,) if named else COMPILERS)):
+        raise InputError(
+            f"--compile: no C++ compiler is found (looked for {named or ', '.join(COMPILERS)}); "
+            "install g++, or leave the option out"
+        )
+
+
+def compiled_update(ppo: PPO) -> Callable[[], dict[str, float]]:
+    """A function that updates an agent as `PPO.update` does, with a compiled loss.
+
+    The order of minibatches, the draws of random numbers and the rule of the learning rate are
+    rsl-rl's; the sums of the kernels are added in another order, so that weights agree to rounding.
+    """
+    device = torch.device(ppo.device)
+    check_compiler(device)
+    cuda = device.type == "cuda"
+    compiled = torch.compile(
+        _Loss(ppo), fullgraph=True, dynamic=False, mode="reduce-overhead" if cuda else None
+    )
+    built = False
+
+    def losses(batch: Any) -> tuple[Tensor, ...]:
+        nonlocal built
+        if cuda:
+            torch.compiler.cudagraph_mark_step_begin()
+        mean, deviation = batch.old_distribution_params
+        given = (batch.actions, batch.values, batch.advantages, batch.returns)
+        seen = [
+            torch.cat([batch.observations[group] for group in network.obs_groups], dim=-1)
+            for network in (ppo.actor, ppo.critic)
+        ]
+        try:
+            found = compiled(*seen, *given, batch.old_actions_log_prob, mean, deviation)
+        except Exception as error:
+            if built:
+                raise
+            cause = getattr(error, "inner_exception", error)
+            raise CompileFailed(
+                f"--compile: torch.compile fails here: {reason_of(cause)}; leave the option out"
+            ) from error
+        built = True
+        return found
+
+    return lambda: _update(ppo, losses)
+
+
+def compile_arms(world: World, count: int) -> None:
+    """Let the arms of a world step batches of `count` rows by compiled tensor operations.
+
+    For devices where an arm is tensor operations: on a CPU its loops are compiled already. Other
+    batches, such as those of an evaluation, are stepped as before. No CUDA graph is made of it,
+    because the next replay would write over the state that it returned.
+    """
+    for arm in world.arms.values():
+        arm.step = _by_rows(arm.step, count)  # type: ignore[method-assign]  # of this arm alone
+
+
+def _by_rows(plain: Callable[..., Any], count: int) -> Callable[..., Any]:
+    fast = torch.compile(plain, dynamic=False)
+
+    def step(stream: Any, part: Any, action: Tensor, dt_s: float) -> Any:
+        return (fast if len(action) == count else plain)(stream, part, action, dt_s)
+
+    return step
+
+
+class _Loss(nn.Module):
+    """rsl-rl's losses of a minibatch as one function of tensors."""
+
+    def __init__(self, ppo: PPO):
+        super().__init__()
+        self.actor, self.critic = ppo.actor, ppo.critic
+        self.noise = cast(ActionNoise, ppo.actor.distribution)
+        self.clip, self.value_weight = ppo.clip_param, ppo.value_loss_coef
+        self.entropy_weight = ppo.entropy_coef
+
+    def forward(
+        self,
+        seen: Tensor,
+        seen_by_critic: Tensor,
+        actions: Tensor,
+        old_values: Tensor,
+        advantages: Tensor,
+        returns: Tensor,
+        old_log_likelihood: Tensor,
+        old_mean: Tensor,
+        old_deviation: Tensor,
+    ) -> tuple[Tensor, ...]:
+        """Loss, and its parts: of values, of actions, entropy; divergence from the old policy."""
+        mean = _outputs(self.actor, seen)
+        deviation = self.noise.deviation()
+        values = _outputs(self.critic, seen_by_critic)
+        ratio = (log_likelihood(actions, mean, deviation) - old_log_likelihood.squeeze(-1)).exp()
+        gain = -advantages.squeeze(-1)
+        bounded = ratio.clamp(1.0 - self.clip, 1.0 + self.clip)
+        surrogate = torch.max(gain * ratio, gain * bounded).mean()
+        near = old_values + (values - old_values).clamp(-self.clip, self.clip)
+        value = torch.max((values - returns).pow(2), (near - returns).pow(2)).mean()
+        chaos = entropy(deviation)
+        loss = surrogate + self.value_weight * value - self.entropy_weight * chaos
+        apart = divergence(old_mean, old_deviation[0], mean.detach(), deviation.detach())
+        return loss, value.detach(), surrogate.detach(), chaos.detach(), apart.mean()
+
+
+def _outputs(network: MLPModel, seen: Tensor) -> Tensor:
+    """Outputs of a network by its layers, which torch.compile sees through."""
+    value = network.obs_normalizer(seen)
+    for layer in network.mlp:
+        value = layer(value)
+    return value
+
+
+def _update(ppo: PPO, losses: Callable[[Any], tuple[Tensor, ...]]) -> dict[str, float]:
+    sums = torch.zeros(3, device=ppo.device)
+    storage, batches, epochs = ppo.storage, ppo.num_mini_batches, ppo.num_learning_epochs
+    for batch in storage.mini_batch_generator(batches, epochs):
+        # rsl-rl draws actions here and leaves them: the stream of random numbers stays the same.
+        torch.empty_like(batch.actions).normal_()
+        ppo.optimizer.zero_grad()  # before the loss: CUDA graphs write over former gradients
+        loss, value, surrogate, chaos, apart = losses(batch)
+        loss.backward()
+        if isinstance(ppo, SharedPPO):
+            ppo.exchange(apart if ppo.adapts else None)
+        elif adapts_rate(ppo):
+            adapt_rate(ppo, apart.item())
+        for network in (ppo.actor, ppo.critic):
+            nn.utils.clip_grad_norm_(network.parameters(), ppo.max_grad_norm)
+        ppo.optimizer.step()
+        sums += torch.stack((value, surrogate, chaos))
+    seen = storage.observations.flatten(0, 1)
+    for network in (ppo.actor, ppo.critic):
+        network.update_normalization(seen)
+    storage.clear()
+    means = (sums / (batches * epochs)).tolist()
+    return dict(zip(("value", "surrogate", "entropy"), means, strict=True))

@@ -1,0 +1,106 @@
+"""Updates through torch.compile: the weights of rsl-rl's, and one line where nothing compiles."""
+
+import functools
+from dataclasses import replace
+
+import pytest
+import torch
+
+from surgisoft.agents import compiled_update
+from surgisoft.agents.compiled_update import CompileFailed, check_compiler, compile_arms
+from surgisoft.agents.distributed import Processes
+from surgisoft.agents.ppo import collect_rollout, make_ppo, update
+from surgisoft.agents.presets import Plan, Preset
+from surgisoft.agents.training import train_new
+from surgisoft.agents.vec_env import JointEnv
+from surgisoft.cli import run as surgisoft
+from surgisoft.errors import InputError
+from surgisoft.tasks.base import Episodes
+from surgisoft.tasks.registry import config_of, make_task
+
+SMALL = Preset(
+    envs=16, rollout=8, epochs=2, batches=2, hidden=(12, 8), clip=0.02, entropy=0.01,
+    desired_kl=0.005, last_noise=None, normalise=True,
+)  # fmt: skip
+"""All that a loss may have: clips that bite, a learned noise, entropy, a rate that adapts, and normalisation."""
+
+
+def learned(preset, processes, updates=3):
+    """Weights, losses and learning rates after a few updates."""
+    torch.manual_seed(0)
+    env = JointEnv(make_task("track_circle"), preset.envs, 0, preset.action_kPa)
+    agents = make_ppo(env, preset, processes)
+    (ppo,) = agents.values()
+    seen, losses, rates = env.get_observations(), [], []
+    for _ in range(updates):
+        seen, _ = collect_rollout(env, agents, seen, preset.rollout)
+        losses.append(update(ppo))
+        rates.append(ppo.learning_rate)
+    weights = [
+        each.detach().clone() for each in (*ppo.actor.parameters(), *ppo.critic.parameters())
+    ]
+    return weights, losses, rates, torch.rand(1)
+
+
+@pytest.mark.parametrize("processes", [Processes(), Processes(1, 2)])
+def test_a_compiled_update_learns_what_a_plain_one_does(processes, monkeypatch):
+    monkeypatch.setattr(torch.distributed, "all_reduce", lambda tensor, op: tensor.mul_(2.0))
+    plain = learned(SMALL, processes)
+    weights, losses, rates, drawn = learned(replace(SMALL, compile=True), processes)
+    for one, other in zip(weights, plain[0], strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+    for one, other in zip(losses, plain[1], strict=True):
+        assert one == pytest.approx(other, rel=1e-3, abs=1e-5)
+    assert rates == plain[2]
+    assert len(set(rates)) > 1
+    assert torch.equal(drawn, plain[3])  # as many random numbers as rsl-rl draws
+
+
+def test_compiled_arms_step_as_plain_ones_and_only_batches_of_their_size(monkeypatch):
+    sizes = []
+
+    def look(graph, given):
+        return lambda *tensors: (sizes.append(1), graph(*tensors))[1]
+
+    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=look))
+    task = make_task("track_circle")
+    task.world.arms = {name: arm.reference() for name, arm in task.world.arms.items()}
+    episodes, truth = Episodes(task), []
+    for compiled in (False, True):
+        if compiled:
+            compile_arms(task.world, 6)
+        with torch.inference_mode():
+            for count in (5, 6):
+                state = episodes.seeded(0, count)
+                for kPa in (0.3, -0.2):
+                    state, _ = episodes.step(state, {"arm": torch.full((count, 3), kPa)})
+                truth.append(state.world.arms["arm"].points_mm)
+    torch.testing.assert_close(truth[2], truth[0], rtol=0.0, atol=0.0)
+    torch.testing.assert_close(truth[3], truth[1], rtol=0.0, atol=1e-4)
+    assert len(sizes) == 2
+
+
+def test_without_a_compiler_it_is_refused_before_anything_is_written(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    folder = tmp_path / "run"
+    arguments = ["train", "--task", "track_circle", "--steps", "400", "--compile"]
+    assert surgisoft([*arguments, "-o", str(folder)]) == 2
+    error = capsys.readouterr().err.strip()
+    assert "no-such-compiler" in error
+    assert len(error.splitlines()) == 1
+    assert not folder.exists()
+    monkeypatch.setattr(compiled_update, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match="Triton"):
+        check_compiler(torch.device("cuda"))
+
+
+def test_a_compilation_that_fails_is_one_line_and_leaves_no_run(tmp_path, monkeypatch):
+    def fails(graph, given):
+        raise RuntimeError("the compiler crashed")
+
+    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=fails))
+    plan = Plan("track_circle", config_of("track_circle"), "fast", replace(SMALL, compile=True), 99)
+    with pytest.raises(CompileFailed, match="the compiler crashed") as error:
+        train_new(tmp_path / "run", plan, Processes(), torch.device("cpu"))
+    assert len(str(error.value).splitlines()) == 1
+    assert not (tmp_path / "run").exists()

@@ -22,7 +22,7 @@ SMALL = Preset(
     envs=16, rollout=8, epochs=2, batches=2, hidden=(12, 8), clip=0.02, entropy=0.01,
     desired_kl=0.005, last_noise=None, normalise=True,
 )  # fmt: skip
-"""All that a loss may have: clips that bite, a learned noise, entropy, a rate that adapts, and normalisation."""
+"""All that a loss may have: clips that bite, learned noise, entropy, a rate that adapts."""
 
 
 def learned(preset, processes, updates=3):

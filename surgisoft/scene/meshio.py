@@ -1,6 +1,7 @@
 """Mesh files: read STL, OBJ, PLY, OFF and GLB, decide their unit of length, write exact PLY."""
 
 import json
+import re
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,16 @@ PLAUSIBLE_MM = (20.0, 600.0)
 """Plausible largest side of an organ or an organ phantom: from a gland to a whole abdomen (mm)."""
 ABSURD = 10.0
 """Factor below or above the plausible range at which a size is an error, not only a warning."""
+
+OWN_HEADER = (
+    "ply\nformat binary_little_endian 1.0\ncomment surgisoft, millimetres\n"
+    "element vertex {}\nproperty double x\nproperty double y\nproperty double z\n"
+    "element face {}\nproperty list uchar int vertex_indices\nend_header\n"
+)
+"""Header of a PLY file that `write_ply` writes, with the numbers of vertices and of faces."""
+OWN_PLY = re.compile(re.escape(OWN_HEADER).replace(r"\{\}", r"(\d{1,9})").encode("ascii"))
+TRIANGLE = np.dtype([("count", "u1"), ("corner", "<i4", 3)])
+"""A face of such a file: three, and its corners."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +62,8 @@ def read_parts(path: str | Path) -> tuple[Part, ...]:
         _check_stl(path)
     if path.suffix.lower() in (".glb", ".gltf"):
         _check_gltf(path)
-    pieces, points = _load(path)
+    own = _load_own(path) if path.suffix.lower() == ".ply" else None
+    pieces, points = _load(path) if own is None else ([own], 0)
     if not pieces and points:
         raise InputError(
             f"{path}: holds {points} points or lines but no faces; "
@@ -124,6 +136,23 @@ def _check_gltf(path: Path) -> None:
         raise InputError(f"{path}: cannot be read as glTF ({reason[:120]}); {wanted}") from None
     if most > size:
         raise InputError(f"{path}: claims {most} numbers in {size} bytes; {wanted}")
+
+
+def _load_own(path: Path) -> Part | None:
+    """The mesh of a PLY as `write_ply` writes it, without trimesh, whose import takes longer than
+    a scene; None for any other file."""
+    content = path.read_bytes()
+    match = OWN_PLY.match(content)
+    if match is None:
+        return None
+    count, faces, begin = int(match[1]), int(match[2]), match.end()
+    if len(content) != begin + 24 * count + TRIANGLE.itemsize * faces or not count or not faces:
+        return None
+    rows = np.frombuffer(content, TRIANGLE, faces, begin + 24 * count)
+    if (rows["count"] != 3).any():
+        return None
+    vertices = np.frombuffer(content, "<f8", 3 * count, begin).reshape(-1, 3)
+    return Part(path.name, vertices.astype(np.float64), rows["corner"].astype(np.int64))
 
 
 def _load(path: Path) -> tuple[list[Part], int]:
@@ -236,13 +265,8 @@ def given_unit(path: Path, size: float, unit: str | None, scale: float | None) -
 
 def write_ply(mesh: Mesh, path: str | Path) -> None:
     """Write a binary PLY with float64 vertices: reading it gives the same mesh, bit for bit."""
-    header = (
-        "ply\nformat binary_little_endian 1.0\ncomment surgisoft, millimetres\n"
-        f"element vertex {len(mesh.vertices_mm)}\n"
-        "property double x\nproperty double y\nproperty double z\n"
-        f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    rows = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("corner", "<i4", 3)])
+    header = OWN_HEADER.format(len(mesh.vertices_mm), len(mesh.faces))
+    rows = np.empty(len(mesh.faces), dtype=TRIANGLE)
     rows["count"], rows["corner"] = 3, mesh.faces
     body = mesh.vertices_mm.astype("<f8").tobytes() + rows.tobytes()
     write_atomically(Path(path), header.encode("ascii") + body)

@@ -228,11 +228,12 @@ def test_a_policy_of_another_scene_is_warned_of(tmp_path):
 
 def test_the_command_imports_nothing_of_pictures_and_training():
     """Matplotlib and Rerun, which only pages and replays need, and rsl-rl, which only training
-    needs, take seconds to import."""
+    needs, take seconds to import; trimesh, which only meshes of others need, a quarter of one."""
     code = (
         "import sys; from surgisoft.cli import run; "
         "run('evaluate ring --episodes 1 --no-exact-checks'.split()); "
-        "slow = {'matplotlib', 'rerun', 'rsl_rl', 'tensordict', 'torch', 'torch._dynamo'}; "
+        "slow = {'matplotlib', 'rerun', 'rsl_rl', 'tensordict', 'torch', 'torch._dynamo', "
+        "'trimesh', 'networkx'}; "
         "print(sorted(slow & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

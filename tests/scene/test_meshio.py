@@ -68,6 +68,37 @@ def test_ply_keeps_every_bit(tmp_path):
     assert read_mesh(tmp_path / "m.ply").content_hash == mesh.content_hash
 
 
+def test_a_ply_of_this_package_is_read_as_trimesh_reads_it(tmp_path, monkeypatch):
+    write_ply(lumpy(3), tmp_path / "m.ply")
+    (own,) = read_parts(tmp_path / "m.ply")
+    content = (tmp_path / "m.ply").read_bytes()
+    (tmp_path / "m.ply").write_bytes(content.replace(b"surgisoft", b"something"))
+    (theirs,) = read_parts(tmp_path / "m.ply")
+    assert own.name == theirs.name == "m.ply"
+    for one, other in ((own.vertices, theirs.vertices), (own.faces, theirs.faces)):
+        assert one.dtype == other.dtype
+        assert np.array_equal(one, other)
+    (tmp_path / "m.ply").write_bytes(content)
+    monkeypatch.setattr(trimesh, "load_scene", None)  # which is not asked
+    assert np.array_equal(read_parts(tmp_path / "m.ply")[0].faces, own.faces)
+
+
+@pytest.mark.parametrize("damage", ["cut", "longer", "count", "corner"])
+def test_a_damaged_ply_of_this_package_is_refused(damage, tmp_path):
+    mesh = Mesh(np.eye(3), np.array([[0, 1, 2]]))
+    write_ply(mesh, tmp_path / "m.ply")
+    content = (tmp_path / "m.ply").read_bytes()
+    broken = {
+        "cut": content[:-1],
+        "longer": content + b"x",
+        "count": content[:-13] + b"\x04" + content[-12:],
+        "corner": content[:-4] + b"\x09\0\0\0",
+    }[damage]
+    (tmp_path / "m.ply").write_bytes(broken)
+    with pytest.raises(InputError, match=r"m\.ply"):
+        read_parts(tmp_path / "m.ply")
+
+
 @given(size=st.floats(1e-3, 1e4), suffix=st.sampled_from([".stl", ".ply", ".obj", ".glb"]))
 def test_no_size_is_scaled_by_a_guess(size, suffix):
     """A file's own unit is mm, metres for glTF; where that is no organ's size, the user decides."""

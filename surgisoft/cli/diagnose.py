@@ -14,7 +14,14 @@ from surgisoft.cli.files import (
     check_replay,
     show_written,
 )
-from surgisoft.cli.inputs import check_model, read_before, read_recordings, warn, warn_all
+from surgisoft.cli.inputs import (
+    IN_A_MAP,
+    check_model,
+    read_before,
+    read_recordings,
+    warn,
+    warn_all,
+)
 from surgisoft.cli.options import (
     REFIT_PROCESSES,
     AnyModel,
@@ -34,6 +41,7 @@ from surgisoft.cli.options import (
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
 from surgisoft.files import write_json
+from surgisoft.progress import Progress
 
 MOST_KEPT = 1 << 25
 """Size of the largest blocks of freed memory that stay with the process, bytes: the temporaries of
@@ -118,7 +126,7 @@ def diagnose(
             before=earlier,
             paired=paired,
             refit=refit,
-            refit_progress=tell,
+            refit_progress=_announced(tell),
             processes=REFIT_PROCESSES,
             predictions=predictions,
             error_mm=model_error,
@@ -166,6 +174,21 @@ def diagnose(
         print(f"next: {following}")
 
 
+def _announced(tell: Progress) -> Progress:
+    """Progress of a fit with the network, which says first that it takes minutes."""
+    begun = False
+
+    def report(done: float, total: float, note: str = "") -> None:
+        nonlocal begun
+        if not begun:
+            begun = True
+            note_line = "candidates are fitted together with the network, which takes minutes"
+            typer.echo(f"surgisoft: diagnose: {note_line}; --refit never skips it", err=True)
+        tell(done, total, note)
+
+    return report
+
+
 def _following(command: str, predicted: bool, of_model: str) -> str:
     """The command to run next, with the options that say what MODEL is.
 
@@ -196,7 +219,7 @@ def _next_after_setup(setup, model: Path, data: str, of_model: str, apply: str |
 def _show_setup(setup) -> None:
     """Print how to correct the faults of a set-up."""
     print(f"recordings with this fault: {', '.join(setup.recordings)}")
-    where = ", in the map of `surgisoft import`" if setup.correctable else ""
+    where = f" (--apply does it), {IN_A_MAP}" if setup.correctable else ""
     print(f"to correct it{where}:")
     print(textwrap.indent(setup.instructions, "  "))
     for other in setup.alternative_instructions:
@@ -230,6 +253,9 @@ def _show(found) -> None:
         )
     for each in found.not_testable:
         print(f"not testable: {each.effect}: {each.reason}")
+    if found.implausible:
+        names = ", ".join(found.implausible)
+        print(f"not ranked: {names} (only implausible parameters would explain anything)")
     if found.refit is not None:
         _show_refit(found.refit)
     if found.next_experiment:

@@ -19,6 +19,9 @@ from surgisoft.cli.options import (
 from surgisoft.cli.progress import progress
 from surgisoft.errors import Interrupted
 
+ABOVE_NOISE = 2.0
+"""Ratio of the held-out error to the noise from which `fit` advises to try effects with memory."""
+
 
 @app.command()
 def fit(
@@ -136,5 +139,12 @@ def fit(
     if result.interrupted is not None:
         warn(result.interrupted.sentence)
         raise typer.Exit(INTERRUPTED)
+    moved = any(recording.kind == "continuous" for recording in train)
+    error = result.model.validation
+    unexplained = error.noise_mm is None or (error.rmse_mm or 0.0) > ABOVE_NOISE * error.noise_mm
+    if not effects and network == "haw_nn" and unexplained and moved:
+        files = " ".join(map(str, recordings))
+        again = with_effect_files(f"surgisoft fit {files} --effects auto -o {output}_with_effects")
+        print(f"next, whether the arm has memory that this model lacks: {again}")
     following = with_effect_files(f"surgisoft compare {output} TEST.parquet --test --report PAGE")
     print(f"next, its error on an unseen recording: {following}")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.inputs import check_model, read_recordings, warn
+from surgisoft.cli.inputs import IN_A_MAP, check_model, read_recordings, warn
 from surgisoft.cli.options import EffectFiles, Force, Recordings
 from surgisoft.errors import InputError
 
@@ -142,7 +142,7 @@ def _test_setup(arm: "ArmModel", name: str, recordings: list) -> None:
         print(f"set-up: no fault that {name} shows")
         return
     warn(f"set-up: {found.sentence}")
-    print("to correct it, in a map that reads the recording (docs/diagnosis.md, set-up faults):")
+    print(f"to correct it, {IN_A_MAP}:")
     print(textwrap.indent(found.instructions, "  "))
 
 

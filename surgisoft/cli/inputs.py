@@ -7,6 +7,9 @@ import typer
 
 from surgisoft.errors import InputError, unknown_name
 
+IN_A_MAP = "as lines of a map that reads the recording, not its raw files"
+"""Where the lines of a map belong that correct a set-up."""
+
 
 def warn(text: str) -> None:
     """Print one line of warning on standard error."""

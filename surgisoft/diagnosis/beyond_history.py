@@ -60,6 +60,8 @@ class BeyondHistory:
     line: float
     """Share of the remainder's power above the noise in its strongest line, less the shares that
     actuation and predicted motion have there, 0 to 1."""
+    line_hz: float
+    """Frequency of that line, Hz; 0 where there is none."""
 
 
 def beyond_history(problem: Problem, features: np.ndarray) -> BeyondHistory:
@@ -78,6 +80,8 @@ def beyond_history(problem: Problem, features: np.ndarray) -> BeyondHistory:
     sums = [np.square(each, dtype=float).sum() for each in broken]
     place = int(np.argmin(sums))
 
+    line, line_hz = strongest_line(problem, remainder)
+
     def losses(rows: np.ndarray) -> np.ndarray:
         return block_sums(np.square(rows, dtype=float).sum(1), problem.block)
 
@@ -85,7 +89,8 @@ def beyond_history(problem: Problem, features: np.ndarray) -> BeyondHistory:
         losses=losses(remainder),
         break_losses=losses(broken[place]),
         break_at=float(places[place]),
-        line=strongest_line(problem, remainder),
+        line=line,
+        line_hz=line_hz,
     )
 
 
@@ -175,11 +180,12 @@ class _Folds:
         return answer
 
 
-def strongest_line(problem: Problem, remainder: np.ndarray) -> float:
-    """Share of the power above the noise (S, C) in the strongest line that is only there."""
+def strongest_line(problem: Problem, remainder: np.ndarray) -> tuple[float, float]:
+    """Share of the power above the noise (S, C) in the strongest line that is only there, and its
+    frequency in Hz; above half the rate of the problem's rows it is that of its alias."""
     spectrum = _Spectrum.of(problem)
     if spectrum is None:
-        return 0.0
+        return 0.0, 0.0
     power = float(np.square(remainder - remainder.mean(0), dtype=float).sum(1).mean())
     noise = float(np.square(problem.noise_mm).sum())
     above = max(power - noise, LEAST_ABOVE * power, 1e-30)
@@ -190,7 +196,11 @@ def strongest_line(problem: Problem, remainder: np.ndarray) -> float:
         spread = float(np.square(each - each.mean(0)).sum(1).mean())
         if spread > 0:
             others = np.maximum(others, spectrum.power(each) / spread)
-    return float(np.clip((own - others).max(initial=0.0), 0.0, 1.0))
+    apart = own - others
+    if not apart.size or apart.max() <= 0.0:
+        return 0.0, 0.0
+    best = int(apart.argmax())
+    return float(min(apart[best], 1.0)), spectrum.hertz(best)
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,6 +213,8 @@ class _Spectrum:
     """Points of the transform."""
     first: int
     """First frequency that counts."""
+    step_s: float
+    """Time between two points, s."""
 
     @classmethod
     def of(cls, problem: Problem) -> "_Spectrum | None":
@@ -221,7 +233,11 @@ class _Spectrum:
             groups.append((rows, places))
             longest = max(longest, int(places.max()) + 1)
         points = 1 << int(np.ceil(np.log2(max(OVERSAMPLED * longest, 2))))
-        return cls(groups, points, int(np.ceil(LEAST_PERIODS * points / longest)))
+        return cls(groups, points, int(np.ceil(LEAST_PERIODS * points / longest)), step)
+
+    def hertz(self, line: int) -> float:
+        """Frequency of one of the lines of `power`, Hz."""
+        return (self.first + line) / (self.points * self.step_s)
 
     def power(self, series: np.ndarray) -> np.ndarray:
         """(F,) power of a series (S, C) in each line: its own mean square for a sine."""

@@ -115,6 +115,15 @@ def data_quality_warnings(problem: Problem) -> list[str]:
             f"the model's whole validated error ({validated:.3g} mm): worse cameras, or something "
             "shakes the arm; smaller effects cannot be seen"
         )
+    table = problem.table
+    if problem.model.spec.actuation == "measured" and np.array_equal(
+        table.pressure, table.commanded
+    ):
+        warnings.append(
+            "measured and commanded actuation are equal in every row: a log without sensors, or a "
+            "simulation? What the line delays then looks like a lag of the arm; if there are no "
+            "sensors, use a model of the commands (fit --actuation commanded)"
+        )
     missing = float(np.isnan(problem.measured).mean())
     if missing > MOST_MISSING:
         warnings.append(f"{100 * missing:.0f} % of the key points are missing")

@@ -80,6 +80,11 @@ one-sided)."""
 VARIES = 0.04
 """Least variance of an amplitude between motions, in units of its square, that a check mentions: a
 standard deviation of a fifth of the amplitude. Chosen before any case was looked at."""
+ABOUT = 1.1
+"""Ratio up to which the errors that effects of a set would leave are said to be about the same."""
+MOSTLY = 0.5
+"""Share of what is left in one line of its spectrum from which the motion is said to be periodic:
+most of it."""
 FITTED_STAGES = ("line", "material")
 """Stages of effects that a network can be fitted together with."""
 MOST_FITTED = 3
@@ -197,6 +202,9 @@ class Diagnosis:
     """The numbers that the decision was made from."""
     not_testable: tuple[NotTestable, ...] = ()
     """Effects that these recordings cannot show; they are not ranked."""
+    implausible: tuple[str, ...] = ()
+    """Effects that explain nothing with parameters in their plausible ranges; they are not
+    ranked."""
     probabilities: Probabilities | None = None
     """Calibrated probabilities of what is true."""
     next_command: str = ""
@@ -477,7 +485,7 @@ def with_refit(result: Diagnosis, joint: Refit, problem: Problem) -> Diagnosis:
             if claimable(evidence):
                 none = Decision("nothing_missing", (), quiet, chances)
             if verdict.effects or verdict.reason == "learned":
-                sentence = sentence_of(none, result.error_mm, result.error_mm.before)
+                sentence = sentence_of(none, result.error_mm, [result.error_mm.before])
                 verdict = Verdict(none.kind, (), sentence, round(quiet, 4), none.reason)
                 ranking = tuple(replace(row, confidence=0.0) for row in ranking)
                 command, competing, plan = next_command(none), (), None
@@ -514,7 +522,7 @@ def result_of(found: Findings, decision: Decision | None = None) -> Diagnosis:
             f"; {' or '.join(others)} explains the recordings about as well as one of the two"
         )
     if kind == "unknown_effect":
-        sentence += knock(evidence)
+        sentence += knock(evidence) + periodic(evidence)
     plan = recommend(problem, effects).experiment if kind == "ambiguous" else None
     return Diagnosis(
         verdict=Verdict(kind, effects, sentence, round(sure, 4), decision.reason),
@@ -528,6 +536,9 @@ def result_of(found: Findings, decision: Decision | None = None) -> Diagnosis:
             *amplitudes_that_vary(evidence, decision),
         ),
         statistics=evidence,
+        implausible=tuple(
+            name for name in found.selection.options if name not in {row.effect for row in ranking}
+        ),
         probabilities=decision.probabilities,
         statements=decision.statements,
         next_command=next_command(decision),
@@ -594,11 +605,28 @@ def knock(evidence: Evidence) -> str:
     return f"; a turn of the whole body at one moment, as by a knock, explains more than {best}"
 
 
-def _reached(found: Findings, effects: tuple[str, ...], kind: Kind) -> float:
-    """Held-out error with the named effects, or with the first of a set, mm."""
+def _reached(found: Findings, effects: tuple[str, ...], kind: Kind) -> list[float]:
+    """Held-out error with the named effects, or with each of a set, mm."""
+    apart = [(effect,) for effect in effects] if kind == "ambiguous" else [effects]
+    return [_left_by(found, each) for each in apart]
+
+
+def periodic(evidence: Evidence) -> str:
+    """End of the sentence on an unknown effect: that it is a periodic motion, or empty.
+
+    Said where most of what a black box with memory leaves is in one line of its spectrum.
+    """
+    if evidence.line < MOSTLY or not evidence.line_hz:
+        return ""
+    return (
+        f"; {100 * evidence.line:.0f} % of what no function of the actuation explains is a motion "
+        f"at {evidence.line_hz:.3g} Hz that the actuation does not have, as of a base that moves"
+    )
+
+
+def _left_by(found: Findings, effects: tuple[str, ...]) -> float:
+    """Held-out error with effects, mm."""
     selection = found.selection
-    if kind == "ambiguous":
-        effects = effects[:1]
     for proposal in found.proposals:
         if set(proposal.effects) == set(effects):
             return selection.rmse_mm(selection.losses(proposal.chosen))
@@ -643,28 +671,31 @@ def _share(value: float) -> float:
 
 
 def sentence_of(
-    decision: Decision, levels: ErrorLevels, reached: float, where: str = HELD_OUT
+    decision: Decision, levels: ErrorLevels, reached: Sequence[float], where: str = HELD_OUT
 ) -> str:
-    """The verdict in words. reached: error with the named effects on blocks that these were not
-    fitted to, mm; where: these blocks in words."""
+    """The verdict in words. reached: error with the named effects, or with each of a set, on blocks
+    that these were not fitted to, mm; where: these blocks in words."""
     kind, effects, sure = decision.kind, decision.effects, decision.confidence
     error = f"error {levels.before:.3g} mm, floor {levels.floor:.3g} mm"
     if kind == "identified":
         return (
-            f"{effects[0]} is missing (confidence {sure:.2f}): with it {reached:.3g} mm remain on "
-            f"{where}; {error}"
+            f"{effects[0]} is missing (confidence {sure:.2f}): with it {reached[0]:.3g} mm remain "
+            f"on {where}; {error}"
         )
     if kind == "several":
         together = " and ".join(effects)
         return (
             f"{together} are missing (confidence {sure:.2f} in both): with them "
-            f"{reached:.3g} mm remain on {where}; {error}"
+            f"{reached[0]:.3g} mm remain on {where}; {error}"
         )
     if kind == "ambiguous":
+        each = f"each would leave about {reached[0]:.3g} mm"
+        if max(reached) > ABOUT * min(reached):
+            values = " and ".join(f"{value:.3g} mm" for value in reached)
+            each = f"they would leave {values}, in this order,"
         return (
             f"cannot tell {' from '.join(effects)} with these recordings (confidence {sure:.2f} "
-            f"that it is one of them): each would leave about {reached:.3g} mm on {where}; "
-            f"{error}"
+            f"that it is one of them): {each} on {where}; {error}"
         )
     if kind == "unknown_effect":
         near = next(iter(decision.probabilities.effects), None)

@@ -173,6 +173,8 @@ class Evidence:
     line: float = 0.0
     """Share of what the free black box leaves above the noise in one line of its spectrum that is
     none of the actuation or the predicted motion."""
+    line_hz: float = 0.0
+    """Frequency of that line, Hz; 0 where there is none."""
     sudden_log_gain: float = 0.0
     """Log gain of a sudden turn of the whole body (`beyond_history`) over the best single proposal,
     where that is an effect that moves the base; 0 elsewhere."""
@@ -239,6 +241,7 @@ def evidence_of(found: Findings) -> Evidence:
         free_log_gain=float(selection.log_ratio(null, free).mean()),
         break_log_gain=float(selection.log_ratio(beyond.losses, beyond.break_losses).mean()),
         line=beyond.line,
+        line_hz=beyond.line_hz,
         sudden_log_gain=float(sudden.mean()),
         sudden_margin=_margin(found, sudden),
     )

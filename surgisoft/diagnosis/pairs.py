@@ -206,7 +206,7 @@ class Change:
                 f"no actuation in common with {names}: the model's residuals are compared with its "
                 "residuals there"
             )
-        delays = sorted({f"{each.delay_s:.2f} s" for each in self.stretches[:DELAYS_SHOWN]})
+        delays = sorted({f"{each.delay_s:z.2f} s" for each in self.stretches[:DELAYS_SHOWN]})
         return (
             f"{100 * self.paired_share:.0f} % of the rows are paired with {names} (delay "
             f"{', '.join(delays)}); change {self.change_mm:.3g} mm, repeatability "

@@ -159,7 +159,7 @@ def diagnosis(**fields) -> SimpleNamespace:
         "verdict": SimpleNamespace(kind="setup", sentence="the frame is turned"),
         "error_mm": SimpleNamespace(before=0.5, floor=0.05, best_achievable=0.1), "track": None,
         "setup": None, "next_command": "", "next_experiment": None, "refit": None, "checks": (),
-        "shown": (), "not_testable": (), "seconds": 1.5, "in_fit": 0.0,
+        "shown": (), "not_testable": (), "implausible": (), "seconds": 1.5, "in_fit": 0.0,
         "left_out": "held-out blocks", "change": None,
     }  # fmt: skip
     found = result(**(values | fields))
@@ -181,7 +181,7 @@ def test_diagnose_prints_what_mends_a_set_up(bench, tmp_path, capsys, monkeypatc
     assert not new.exists()
     found = diagnosis(setup=found_setup(correctable=True))
     out = printed(capsys, monkeypatch, target, found, *command)
-    assert "to correct it, in the map of `surgisoft import`:" in out
+    assert "to correct it (--apply does it), as lines of a map that reads the recording, n" in out
     assert out.endswith(f"next: surgisoft diagnose default {rec} --apply CORRECTED\n")
     out = printed(capsys, monkeypatch, target, found, *command, "--apply", str(new))
     assert out.endswith(f"next: surgisoft diagnose default {new}\n")
@@ -214,6 +214,7 @@ def test_diagnose_prints_candidates_and_the_next_step(bench, capsys, monkeypatch
         verdict=SimpleNamespace(kind="ambiguous", sentence="creep or leak"), refit=refit,
         shown=[row], checks=("the clock is even",), next_experiment=plan,
         not_testable=[SimpleNamespace(effect="drift", reason="too short")],
+        implausible=("payload", "twist"),
         next_command="surgisoft next-experiment {model} {data}{before} -o NEW.csv", change=CHANGE,
     )  # fmt: skip
     rec = str(bench / "bench.parquet")
@@ -224,6 +225,7 @@ def test_diagnose_prints_candidates_and_the_next_step(bench, capsys, monkeypatch
     assert "check: the clock is even\n" in out
     assert re.search(r"creep +0\.90 +50\.0% +25\.0% +0\.1500 \[0\.1000, 0\.2000\] mm", out)
     assert "not testable: drift: too short" in out
+    assert "not ranked: payload, twist (only implausible parameters would expl" in out
     assert "fitted together with the network, because a lag is close:" in out
     assert re.search(r"lag .*\[0\.0100, 0\.0200\] mm +0\.0100  implausible parameters\n", out)
     assert "not tried, because steady-state samples cannot show them: leak\n" in out

@@ -71,7 +71,9 @@ def test_a_breath_is_a_line_and_a_periodic_actuation_is_none():
     time = PERIOD_S * np.arange(ROWS)
     breath = 0.5 * np.sin(2 * np.pi * 0.21 * time)
     problem, features = posed(breath)
-    assert beyond_history(problem, features).line == pytest.approx(1.0, abs=0.2)
+    found = beyond_history(problem, features)
+    assert found.line == pytest.approx(1.0, abs=0.2)
+    assert found.line_hz == pytest.approx(0.21, abs=0.01)
     wave = 5.0 + 4.0 * np.sin(2 * np.pi * 0.21 * time)
     driven = problem_of(
         still_model(), [recording(0.5 * np.cos(2 * np.pi * 0.21 * time), np.stack([wave, wave], 1))]

@@ -18,7 +18,13 @@ from surgisoft.diagnosis.decision import (
     load_decision,
 )
 from surgisoft.diagnosis.design.schedules import SETUPS
-from surgisoft.diagnosis.diagnose import ErrorLevels, effect_left, next_command, sentence_of
+from surgisoft.diagnosis.diagnose import (
+    ErrorLevels,
+    effect_left,
+    next_command,
+    periodic,
+    sentence_of,
+)
 from surgisoft.diagnosis.estimation.intervals import Parameter
 from surgisoft.diagnosis.improve import Improvement
 from surgisoft.diagnosis.other_models import callable_arm, open_model, polynomial_of
@@ -157,8 +163,21 @@ def decision(kind, *effects, reason=None, chances=CHANCES, statements=()) -> Dec
     ],
 )  # fmt: skip
 def test_each_kind_of_result_has_its_sentence_and_its_next_command(given, sentence, command):
-    assert sentence in sentence_of(given, LEVELS, 0.15)
+    assert sentence in sentence_of(given, LEVELS, [0.15])
     assert next_command(given) == command
+
+
+def test_effects_of_a_set_that_leave_different_errors_have_one_each():
+    given = decision("ambiguous", "creep", "drift")
+    assert "each would leave about 0.15 mm on" in sentence_of(given, LEVELS, [0.15, 0.16])
+    text = "they would leave 0.15 mm and 0.3 mm, in this order, on"
+    assert text in sentence_of(given, LEVELS, [0.15, 0.3])
+
+
+def test_a_periodic_motion_is_said_with_its_frequency():
+    said = periodic(SimpleNamespace(line=0.83, line_hz=0.249))
+    assert "83 % of what no function of the actuation explains is a motion at 0.249 Hz" in said
+    assert periodic(SimpleNamespace(line=0.4, line_hz=0.249)) == ""
 
 
 def test_what_an_experiment_leaves():
@@ -263,21 +282,33 @@ def test_a_model_of_a_bench_that_stood_otherwise_is_diagnosed_with_loads_of_any_
 def test_warnings_about_recordings_are_a_sentence_each():
     def problem(**fields):
         values = {
-            "table": SimpleNamespace(floor=SimpleNamespace(source="stated")), "floor_mm": 0.1,
+            "table": table(), "floor_mm": 0.1,
             "motion": np.arange(8), "measured": np.zeros((10, 2, 3)),
-            "model": SimpleNamespace(validation=SimpleNamespace(rmse_mm=0.05)), "reference": None,
+            "model": SimpleNamespace(
+                validation=SimpleNamespace(rmse_mm=0.05), spec=SimpleNamespace(actuation="measured")
+            ), "reference": None,
         }  # fmt: skip
         return SimpleNamespace(**(values | fields))
 
+    def table(source="stated", commanded=1.0):
+        return SimpleNamespace(
+            floor=SimpleNamespace(source=source), pressure=np.zeros((10, 2)),
+            commanded=np.full((10, 2), commanded),
+        )  # fmt: skip
+
     holes = np.zeros((10, 2, 3))
     holes[:5] = np.nan
-    unknown = SimpleNamespace(floor=SimpleNamespace(source="unknown"))
-    held = SimpleNamespace(floor=SimpleNamespace(source="holds"))
+    unknown, held = table("unknown"), table("holds")
     for fields, message in (
         ({}, None),
         ({"measured": holes}, "50 % of the key points are missing"),
         ({"motion": np.zeros(8, int)}, "their 8 blocks of time show 1 different motions"),
         ({"table": unknown}, "state noise_mm in the sidecar for a better noise floor"),
+        (
+            {"table": table(commanded=0.0)},
+            "measured and commanded actuation are equal in every row",
+        ),
+        ({"table": table(commanded=np.nan)}, None),
         ({"table": held}, "scatter by 0.1 mm, more than the model's whole validated error (0.05"),
     ):
         found = data_quality_warnings(problem(**fields))

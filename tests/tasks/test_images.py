@@ -13,7 +13,7 @@ from surgisoft.errors import InputError
 from surgisoft.scene import frames
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.dose_patch import LESION
-from surgisoft.scene.images import Label
+from surgisoft.scene.images import IMAGES, Label
 from surgisoft.scene.render import SAMPLE_MM, Renderer, stained
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.registry import make_with
@@ -112,6 +112,23 @@ def test_the_image_is_the_replays_with_beam_lesion_and_dose(task, burnt):
         assert (dark != picture).any()
     found = set(drawn["segmentation"].unique().tolist())
     assert found >= {Label.ORGAN, Label.LESION, Label.ABLATED}
+
+
+def test_images_do_not_depend_on_the_number_of_threads(task):
+    """Nine episodes: two blocks of those that a thread draws at a time."""
+    count, before = IMAGES + 1, torch.get_num_threads()
+    drawn, world = [], Episodes(task).seeded(3, count).world
+    images = images_of(task.world.scene, task.world.config.endoscope_images, "ring")
+    try:
+        for n in (1, 2, 5):
+            torch.set_num_threads(n)
+            drawn.append(images.of(world.arms, world.scene))
+    finally:
+        torch.set_num_threads(before)
+    for kind in KINDS.split(","):
+        assert drawn[0][kind][-1].any()
+        for other in drawn[1:]:
+            assert torch.equal(drawn[0][kind], other[kind])
 
 
 def test_without_images_nothing_changes_and_wrong_ones_are_refused(task):

@@ -660,15 +660,20 @@ def rows(
         str, typer.Option(help="Rows of recordings that are diagnosed, with commas.")
     ] = "12000,200000,2000000",
     faces: Annotated[str, typer.Option(help="Faces of organs, with commas.")] = "80000,500000",
+    slices: Annotated[
+        str, typer.Option(help="Slices of 512 x 512 of segmented images, with commas.")
+    ] = "200",
     output: Output = None,
 ) -> None:
-    """Processor time and memory of commands on large files."""
+    """Processor time and memory of commands on large files; '' leaves a kind out."""
     from benchmarks.rows import markdown, run
 
-    numbers = _numbers("--rows", sizes), _numbers("--faces", faces)
+    given = {"--rows": sizes, "--faces": faces, "--diagnosed": diagnosed, "--slices": slices}
+    numbers = [_numbers(option, text) if text else [] for option, text in given.items()]
     with progress("rows") as report:
-        found = run(*numbers, _numbers("--diagnosed", diagnosed), report)
-    command = f"surgisoft benchmark rows --rows {sizes} --diagnosed {diagnosed} --faces {faces}"
+        found = run(*numbers, report)
+    words = [f"{option} {text or repr(text)}" for option, text in given.items()]
+    command = " ".join(["surgisoft benchmark rows", *words])
     _show("Cost of commands on large files", command, markdown(found), output)
 
 

@@ -76,7 +76,10 @@ def arm():
 
 MADE = {
     "track_circle, 1024 episodes": lambda: world("track_circle", 1024, 20),
+    "circle_ablation, 1 episode": lambda: world("circle_ablation", 1, 60),
+    "circle_ablation, 256 episodes": lambda: world("circle_ablation", 256, 12),
     "circle_ablation, 1024 episodes": lambda: world("circle_ablation", 1024, 6),
+    "circle_ablation, 4096 episodes": lambda: world("circle_ablation", 4096, 3),
     "one track_circle": lambda: single("track_circle", None, 100),
     "one circle_ablation, batched geometry": lambda: single("circle_ablation", "batched", 60),
     "one circle_ablation, FCL": lambda: single("circle_ablation", "fcl", 40),
@@ -98,7 +101,10 @@ for line in sys.stdin:
 """
 OPERATIONS = (
     "track_circle, 1024 episodes",
+    "circle_ablation, 1 episode",
+    "circle_ablation, 256 episodes",
     "circle_ablation, 1024 episodes",
+    "circle_ablation, 4096 episodes",
     "one track_circle",
     "one circle_ablation, batched geometry",
     "one circle_ablation, FCL",

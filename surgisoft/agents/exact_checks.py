@@ -135,8 +135,10 @@ class ExactChecks:
         self.dt_s, self.radii = task.world.config.dt_s, around.geometry.radii_mm
         self.around, self.checker = around, CollisionChecker(around.geometry.bodies)
         self.beam_mm = around.beam_mm if isinstance(around, SceneEngine) else math.nan
-        same = around.geometry.compiled
-        self._bounds = around.geometry if same else BatchedScene(around.geometry.bodies, self.radii)
+        self._bounds = around.geometry
+        if not around.geometry.compiled:
+            bodies, stretch = around.geometry.bodies, around.geometry.stretch
+            self._bounds = BatchedScene(bodies, self.radii, stretch=stretch)
         self._notes: dict[int, _Notes] = defaultdict(_Notes)
         self._beams: dict[str, list[_Beam]] = defaultdict(list)
 

@@ -94,10 +94,13 @@ class BatchedScene:
         most_nodes: int = MOST_NODES,
         cache: Path | None = None,
         engine: str | None = None,
+        stretch: float = 1.0,
     ):
         """`engine` is `compiled` (CPU only, its default), `torch` or `warp` (any device).
 
-        The default on an accelerator is `warp` where it is installed, else `torch`.
+        The default on an accelerator is `warp` where it is installed, else `torch`. stretch: the
+        largest factor by which a length in the world is longer in the frame of a strained body
+        (`Placement`): as far beyond the horizon its distances are looked up.
         """
         for name, radius in radii_mm.items():
             if not (math.isfinite(radius) and radius > 0.0):
@@ -116,9 +119,10 @@ class BatchedScene:
         self._surfaces: list[Any] = []
         self._trees: list[TriangleTree] = []
         self._at_home = {body.name: self._inverse(_pose_of(body)) for body in self.bodies}
+        self.stretch = max(1.0, float(stretch))
+        margin = 5.0 * math.ceil(self.stretch * (self.horizon_mm + thickest) / 5.0)
         for body in self.bodies:
             tree = build_tree(body.mesh)
-            margin = 5.0 * math.ceil((self.horizon_mm + thickest) / 5.0)
             band = 5.0 * math.ceil((thickest + self.exact_within_mm + 5.0) / 5.0)
             field = load_field(body.mesh, margin, band, most_nodes, tree, cache)
             self._surfaces.append(kind(tree, field, self.device))
@@ -147,7 +151,7 @@ class BatchedScene:
             for a, ((line, given), radius) in enumerate(zip(fine, radii, strict=True)):
                 measure = surface.clearance
                 if isinstance(poses, Placement) and body.name in poses.at_rest:
-                    measure = partial(strained_clearance, surface)
+                    measure = partial(strained_clearance, surface, self.stretch)
                 bodies[:, a, n] = measure(
                     line, given, turn, shift, radius, self.exact_within_mm, self.horizon_mm
                 )
@@ -636,6 +640,7 @@ class LoneBeam:
 
 def strained_clearance(
     surface: Surface,
+    stretch: float,
     lines: torch.Tensor,
     given: torch.Tensor,
     turn: torch.Tensor,
@@ -649,8 +654,11 @@ def strained_clearance(
     The surface is plane between the arm and its nearest point, so that a distance d along the
     normal n of the body's frame is d / |T^T n| in the world, T the linear map from the world. n is
     the slope of the distance as the arm is shifted (the envelope theorem), by forward differences.
+    A distance beyond the horizon in the body's frame may be less in the world, by the factor
+    stretch.
     """
-    place = (radius, within, horizon)
+    own_horizon = stretch * (horizon + radius) - radius + SLOPE_MM
+    place = (radius, within, own_horizon)
     least = surface.clearance(lines, given, turn, shift, *place)
     slope = torch.stack(
         [
@@ -663,7 +671,7 @@ def strained_clearance(
     normal = slope / size.clamp(min=1e-9)
     scale = (normal[:, None] @ turn)[:, 0].norm(dim=1)
     found = (least + radius) / scale.to(least.dtype) - radius
-    known = (size[:, 0] > 0.5 * SLOPE_MM) & (least < horizon - SLOPE_MM)
+    known = (size[:, 0] > 0.5 * SLOPE_MM) & (least < own_horizon - SLOPE_MM)
     return torch.where(known, found, least).clamp(max=horizon)
 
 

@@ -18,6 +18,7 @@ from surgisoft.scene.capsules import ArmShape, BatchClearance, segment_distance,
 from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.inside import winding_numbers
 from surgisoft.scene.mesh import Body, Mesh
+from surgisoft.scene.moving import Placement
 from surgisoft.scene.torch_queries import (
     TorchSurface,
     chains_apart_torch,
@@ -66,8 +67,8 @@ def organ_scene():
 def on_accelerator(request):
     """Makes the same scene on an engine that otherwise serves accelerators."""
 
-    def made(bodies):
-        return BatchedScene(bodies, {"a": RADIUS}, most_nodes=300_000, engine=request.param)
+    def made(bodies, **more):
+        return BatchedScene(bodies, {"a": RADIUS}, most_nodes=300_000, engine=request.param, **more)
 
     return made
 
@@ -156,6 +157,21 @@ def test_moving_a_body_is_moving_the_arm_back(organ_scene):
     torch.testing.assert_close(
         moved.double(), scene.clearance({"a": carried}).bodies_mm, atol=2e-4, rtol=0
     )
+
+
+@pytest.mark.parametrize("away", [3.0, 20.0, 55.0, 59.0, 59.9, 61.0])
+def test_a_shortened_body_is_as_near_as_its_strained_surface(on_accelerator, away):
+    """A box of 30 mm that is 5 % shorter along y: its side is at 14.25 mm, up to the horizon."""
+    bodies = [Body("box", "organ", box())]
+    shorter = torch.diag(torch.tensor([1.0, 0.95, 1.0, 1.0], dtype=torch.float64))
+    unmoved, level = torch.eye(4, dtype=torch.float64)[None], torch.zeros(1, dtype=torch.int64)
+    poses = Placement({"box": unmoved[0]}, shorter[None], level, unmoved)
+    across = torch.linspace(-8.0, 8.0, 9)[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    line = across + torch.tensor([0.0, 0.95 * 15.0 + away + RADIUS, 0.0])
+    compiled = BatchedScene(bodies, {"a": RADIUS}, most_nodes=300_000, stretch=1.0 / 0.95)
+    for scene in (compiled, on_accelerator(bodies, stretch=1.0 / 0.95)):
+        found = scene.clearance({"a": line[None]}, poses).bodies_mm.item()
+        assert found == pytest.approx(min(away, scene.horizon_mm), abs=0.05)
 
 
 def test_a_diverged_environment_stays_alone(organ_scene, on_accelerator):

@@ -29,7 +29,8 @@ def test_compiled_arms_agree_with_the_reference_over_whole_episodes(name):
     if around is not None:
         engines = ["torch"] + ["warp"] * (find_spec("warp") is not None)
         given = (around.geometry.bodies, around.geometry.radii_mm)
-        others = [BatchedScene(*given, engine=engine) for engine in engines]
+        stretch = around.geometry.stretch
+        others = [BatchedScene(*given, engine=engine, stretch=stretch) for engine in engines]
     with torch.inference_mode():
         world = Episodes(task).seeded(4, EPISODES).world
         stream, found, expected = world.stream, dict(world.arms), dict(world.arms)

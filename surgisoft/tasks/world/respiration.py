@@ -151,6 +151,8 @@ class OrganMotion:
         own[:, 0, 1] = respiration.shear_per_mm * levels
         linear = np.eye(3) + self._axes @ own @ self._axes.T
         self._strains = torch.tensor(about(self.centre_mm, linear), device=device)
+        self.stretch = float(1.0 / np.linalg.svd(linear, compute_uv=False).min())
+        """Largest factor by which a length is longer at rest than under a strain."""
         self._at_rest = {
             body.name: torch.tensor(np.array(body.pose), device=device)
             for body in bodies

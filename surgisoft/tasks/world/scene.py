@@ -146,15 +146,16 @@ class SceneEngine:
         config, spec, self.device = config or SceneEngineConfig(), scene.spec, torch.device(device)
         radii = {name: 0.5 * mount.diameter_mm for name, mount in spec.arms.items()}
         self.lasers, self.endoscopes = spec.arms_with(LASER), spec.arms_with(ENDOSCOPE)
-        self.geometry = BatchedScene(scene.bodies, radii, device, engine=engine)
-        self.collision = collision_engine(config.geometry, self.geometry)
-        self.camera = spec.camera.camera()
-        self.beam_mm = spec.laser.standoff_mm[1] + BEAM_BEYOND_MM
-        self.organ = scene.bodies.index(scene.organ)
         self.motion: OrganMotion | None = None
         if respiration is not None:
             about = np.array(scene.spec.lesion.centre_mm)
             self.motion = OrganMotion(respiration, scene.bodies, about, time_s, self.device)
+        stretch = self.motion.stretch if self.motion else 1.0
+        self.geometry = BatchedScene(scene.bodies, radii, device, engine=engine, stretch=stretch)
+        self.collision = collision_engine(config.geometry, self.geometry)
+        self.camera = spec.camera.camera()
+        self.beam_mm = spec.laser.standoff_mm[1] + BEAM_BEYOND_MM
+        self.organ = scene.bodies.index(scene.organ)
         treated = (plan or rings)(scene, vary, config.band_mm, config.view_points)
         self.work_camera = self.camera
         if treated.field_rad is not None:

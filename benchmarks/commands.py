@@ -389,6 +389,13 @@ def robust(
             help="Robots that also get a model fitted to them, with commas; may be empty."
         ),
     ] = "21,22,23,24,25,26,27,28,29,30",
+    improved: Annotated[
+        str,
+        typer.Option(
+            help="Robots for which the package's model is improved (surgisoft improve), too, with "
+            "commas; may be empty."
+        ),
+    ] = "",
     episodes: Annotated[int, typer.Option(min=1, help="Episodes of each robot.")] = 10,
     hidden_robots: Annotated[
         str, typer.Option(help="Robots with hidden effects, with commas; may be empty.")
@@ -454,6 +461,7 @@ def robust(
         methods,
         seeds("--robots", robots),
         seeds("--own", own),
+        seeds("--improved", improved),
         episodes,
         best,
         seeds("--hidden-robots", hidden_robots),
@@ -468,7 +476,9 @@ def robust(
     if json_file:
         write_json(json_file, {"cases": [asdict(r) for r in rows]})
     command = f"surgisoft benchmark robust --policies {','.join(names.values())}"
-    command += f" --robots {robots} --own '{own}' --episodes {episodes}"
+    command += f" --robots {robots} --own '{own}'"
+    command += f" --improved {improved}" if improved else ""
+    command += f" --episodes {episodes}"
     command += f" --hidden-robots '{hidden_robots}' --hidden-episodes {hidden_episodes}"
     command += f" --hidden {hidden}" if hidden else ""
     command += "" if observers == "filter,learns" else f" --observers {observers}"

@@ -1,10 +1,10 @@
 """Benchmark `robust`: `circle_ablation` on rigs of robots that took no part in any training.
 
 Every method is judged with the model of the package, so that the rig is another robot of the same
-make, and with a model of the robot itself: a lab records ten minutes of it and fits a model to them
-(`surgisoft fit`). Hidden effects, which no model has, are then switched on one at a time. Every
-case, one robot with one method, is a file in the folder of the study, so that an interrupted study
-goes on where it stopped.
+make, and with models of the robot itself: a lab records ten minutes of it and fits a model to them
+(`surgisoft fit`), or adds to the model of the package what they show (`surgisoft improve`). Hidden
+effects, which no model has, are then switched on one at a time. Every case, one robot with one
+method, is a file in the folder of the study, so that an interrupted study goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -25,13 +25,15 @@ from surgisoft.agents.evaluate import bootstrap, evaluate
 from surgisoft.agents.on_rig import RigConfig, named_rig, on_rig
 from surgisoft.agents.policies import open_policy
 from surgisoft.agents.run_folder import RunFolder
+from surgisoft.diagnosis.improve import improve
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.measurement.histories import arm_spec, history_of
 from surgisoft.measurement.protocols import make_protocol
+from surgisoft.measurement.recordings import Recording
 from surgisoft.progress import Progress, Stages
 from surgisoft.rig import Rig, VirtualRig
 from surgisoft.rig.hidden import HIDDEN
-from surgisoft.surrogate.checkpoint import save_model
+from surgisoft.surrogate.checkpoint import default_arm, save_model
 from surgisoft.surrogate.fit import FitConfig, fit
 from surgisoft.tasks.base import Task
 from surgisoft.tasks.registry import config_of, make_task, with_fields
@@ -51,8 +53,9 @@ FIRE_MM = 0.5
 """Measured distance of the beam from its target within which it is released, mm."""
 FILTER, LEARNS = "filter", "learns"
 """The two observers: an alpha-beta filter with one gain, or `tasks.world.adaptation`."""
-DEFAULT, OWN = "of the package", "of the robot"
-"""The two arm models."""
+DEFAULT, OWN, IMPROVED = "of the package", "of the robot", "of the package, improved"
+"""The arm models. The second is fitted to ten minutes of the robot, and the third is the first one
+with the effects that `improve` adds to it by the same recording."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,8 @@ class Study:
     """Seeds of the robots."""
     own: tuple[int, ...]
     """Those that a model is fitted to, too."""
+    improved: tuple[int, ...]
+    """Those for which the package's model is improved, too."""
     episodes: int
     """Episodes of each robot."""
     hidden_methods: tuple[str, ...]
@@ -96,7 +101,8 @@ class Study:
     episodes of it."""
 
     def __post_init__(self):
-        known = [robot for robot in (*self.robots, *self.hidden_robots) if robot in DEVELOPMENT]
+        every = {*self.robots, *self.own, *self.improved, *self.hidden_robots}
+        known = sorted(robot for robot in every if robot in DEVELOPMENT)
         if known:
             raise InputError(
                 f"robust: robots {', '.join(map(str, known))} took part in the development; "
@@ -118,7 +124,7 @@ class Row:
     method: str
     """Name of the method."""
     model: str
-    """`DEFAULT` or `OWN`."""
+    """`DEFAULT`, `OWN` or `IMPROVED`."""
     robot: int
     """Seed of the robot."""
     hidden: str
@@ -146,7 +152,7 @@ class Case:
     method: Method
     """What drives the arms."""
     model: str
-    """`DEFAULT` or `OWN`."""
+    """`DEFAULT`, `OWN` or `IMPROVED`."""
     robot: int
     """Seed of the robot."""
     hidden: str
@@ -198,7 +204,7 @@ def _together(cases: Sequence[Case]) -> Iterator[list[Case]]:
     """Cases in groups whose episodes run side by side: one method, one arm model, one length."""
 
     def alike(case: Case) -> tuple:
-        own = case.robot if case.model == OWN else None
+        own = None if case.model == DEFAULT else case.robot
         return case.method, case.model, own, case.episodes
 
     for _, same in groupby(cases, alike):
@@ -213,7 +219,11 @@ def run(study: Study, folder: Path, report: Progress) -> tuple[list[Row], list[F
     jobs = [
         (method, model, robot, "", study.episodes)
         for method in study.methods
-        for model, robots in ((DEFAULT, study.robots), (OWN, study.own))
+        for model, robots in (
+            (DEFAULT, study.robots),
+            (OWN, study.own),
+            (IMPROVED, study.improved),
+        )
         for robot in robots
     ]
     jobs += [
@@ -235,6 +245,8 @@ def run(study: Study, folder: Path, report: Progress) -> tuple[list[Row], list[F
         stage = stages.stage(len(some), f"{note.strip()} and {len(some) - 1} further cases")
         if first.model == OWN:
             arm = own_model(first.robot, folder)
+        elif first.model == IMPROVED:
+            arm = improved_model(first.robot, folder)
         for case, values in zip(some, _judged(some, arm, stage), strict=True):
             case.kept(kept, lambda values=values: values)
     rows = []
@@ -254,16 +266,30 @@ def _identity(policy: str) -> str:
     return str(RunFolder(policy).checkpoint("best").stat().st_size) + RunFolder(policy).path.name
 
 
+def ten_minutes(robot: int) -> Recording:
+    """A robot's own recording, from which its models are made."""
+    rig = VirtualRig(robot)
+    recording, _ = rig.record(make_protocol("mixed", rig.limits, MINUTES_POINTS, seed=robot))
+    return recording
+
+
 def own_model(robot: int, folder: Path) -> Path:
     """Folder of the model that is fitted to ten minutes of a robot; made once."""
     place = folder / "models" / f"robot-{robot}"
     if not (place / "config.json").is_file():
-        rig = VirtualRig(robot)
-        protocol = make_protocol("mixed", rig.limits, MINUTES_POINTS, seed=robot)
-        recording, _ = rig.record(protocol)
+        recording = ten_minutes(robot)
         config = FitConfig(effects=("hysteresis",), seed=robot)
         result = fit(history_of([recording]), None, arm_spec([recording]), config)
         save_model(result.model, place, result.report(), force=True, known=result.known)
+    return place
+
+
+def improved_model(robot: int, folder: Path) -> Path:
+    """Folder of the package's model after `improve` with ten minutes of a robot; made once."""
+    place = folder / "models" / f"robot-{robot}-improved"
+    if not (place / "config.json").is_file():
+        result = improve(default_arm(), [ten_minutes(robot)])
+        save_model(result.model, place, result.to_json(), force=True)
     return place
 
 
@@ -367,7 +393,7 @@ def markdown(rows: list[Row], floors: list[Floor], study: Study) -> str:
         "|---|---|---|---|---|---|---|---|",
     ]
     for method in study.methods:
-        for model in (DEFAULT, OWN):
+        for model in (DEFAULT, OWN, IMPROVED):
             some = [r for r in rows if (r.method, r.model, r.hidden) == (method.name, model, "")]
             if not some:
                 continue
@@ -445,7 +471,7 @@ def draw(rows: list[Row], floors: list[Floor], study: Study, folder: Path) -> Pa
     groups = [
         (method, model)
         for method in study.methods
-        for model in (DEFAULT, OWN)
+        for model in (DEFAULT, OWN, IMPROVED)
         if any((r.method, r.model, r.hidden) == (method.name, model, "") for r in rows)
     ]
     figure, axes = plt.subplots(figsize=(8.0, 0.42 * len(groups) + 1.4), layout="constrained")

@@ -6,10 +6,24 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.robust import DEFAULT, LEARNS, Case, Method, Robots, robust_task
+from benchmarks.robust import (
+    DEFAULT,
+    IMPROVED,
+    LEARNS,
+    OWN,
+    Case,
+    Method,
+    Robots,
+    Row,
+    Study,
+    markdown,
+    robust_task,
+)
 from benchmarks.robust_estimates import Measured, errors_mm, unfiltered
+from benchmarks.robust_floor import Floor
 from benchmarks.robust_parts import parts
 from surgisoft.agents.on_rig import RigConfig, on_rig
+from surgisoft.errors import InputError
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.reach import steady_key_points
 from surgisoft.tasks.laser_work import LASER
@@ -39,6 +53,33 @@ def test_each_episode_is_on_the_robot_of_its_case():
         arms = place.world.start(streams(2000, 4)).arms
         found = [tip_mm(rig) for rig in arms["arm"].plant.rigs.items]
         np.testing.assert_allclose(found, wanted, atol=0.05)
+
+
+@pytest.mark.parametrize("given", ["robots", "own", "improved", "hidden_robots"])
+def test_no_model_or_policy_is_judged_on_a_robot_of_the_development(given):
+    sets = dict.fromkeys(("robots", "own", "improved", "hidden_robots"), (21,))
+    rest = {"episodes": 1, "hidden_methods": (), "hidden_episodes": 1, "hidden": ()}
+    Study((CASE.method,), **sets, **rest)
+    with pytest.raises(InputError, match="robots 20 took part in the development"):
+        Study((CASE.method,), **{**sets, given: (21, 20)}, **rest)
+
+
+def test_each_model_of_a_robot_has_a_row_of_its_own():
+    method = CASE.method
+    study = Study((method,), (21,), (21,), (21,), 2, (), (), 1, ())
+    numbers = {"pointing_error_mm": [0.2, 0.2], "pointing_error_p95_mm": [0.3, 0.3]}
+    numbers |= {"share_on": [0.7, 0.7], "clearance_mm": [23.0, 23.0], "contact": [False, False]}
+    rows = [
+        Row(method.name, model, 21, "", cut=[True, cut], beam_error_mm=[error, error], **numbers)
+        for model, cut, error in ((DEFAULT, True, 0.3), (OWN, True, 0.2), (IMPROVED, False, 0.1))
+    ]
+    lines = markdown(rows, [Floor(0.5, 0.3, 0.1)], study).splitlines()
+    table = [line for line in lines if line.startswith("| scripted")]
+    assert [line.split(" | ")[1:4] for line in table] == [
+        ["of the package", "2 of 2 (34 to 100 %)", "0.300"],
+        ["of the robot", "2 of 2 (34 to 100 %)", "0.200"],
+        ["of the package, improved", "1 of 2 (9 to 91 %)", "0.100"],
+    ]
 
 
 def test_the_parts_of_an_error_are_those_of_a_known_one():

@@ -16,6 +16,9 @@ most likely of `GROWTHS` is taken: the sizes of groups (see below) are log-norma
 with the least variance of their logarithms. The growth is 0 unless the sum of squares falls by more
 than one more parameter takes away by chance (F test at 5 %, with 1 and K - 2 degrees of freedom).
 
+The scores show the errors at the distances of the groups that were left out, and none nearer to the
+training: where only 5 % of them were nearer, the radius falls no further (`nearest`).
+
 A further run differs from all of those that were scored, so the quantile of few runs covers too
 little of it. Without an assumption on runs no finite radius is certain to hold a share `level` of
 the rows of a further run, on average over runs, unless level <= K / (K + 1), with K runs: 19 runs
@@ -48,6 +51,8 @@ LEVELS = (0.5, 0.6827, 0.8, 0.9, 0.95, 0.975, 0.99)
 """Coverages whose quantiles are stored."""
 GROWTHS = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0)
 """Growths of the score's scale by distance that are tried, per range of a chamber."""
+NEAREST = 0.05
+"""Share of the scored rows below whose distance the scale is not extrapolated."""
 LEAST_GAIN = 0.05
 """Least fall of the mean radius that a growth has to bring where groups are too few for a test, as
 a share of the radius without."""
@@ -88,6 +93,8 @@ class ErrorInterval:
     source: str
     """`cross-validation` (each row predicted by a network whose training left its group out) or
     `held-out rows` (rows that stopped the training and selected the model)."""
+    nearest: float = 0.0
+    """Distance below which radii stay as they are there, in ranges of a chamber."""
 
     def radius_mm(self, distance: Tensor, coverage: float = LEVEL) -> Tensor:
         """(..., n) radii in mm for distances (...) in ranges of a chamber.
@@ -96,6 +103,7 @@ class ErrorInterval:
         share outside; beyond them the nearest is taken.
         """
         quantile = distance.new_tensor(self._quantile(coverage))
+        distance = distance.clamp(min=self.nearest)
         return (1 + distance.unsqueeze(-1) * distance.new_tensor(self.growth)) * quantile
 
     def _quantile(self, coverage: float) -> list[float]:
@@ -126,7 +134,8 @@ class ErrorInterval:
 
     def sentence(self) -> str:
         """The interval on a row like those of the training, in one line."""
-        radii = " ".join(f"{value:.2f}" for value in self._quantile(LEVEL))
+        least = self.radius_mm(torch.tensor(0.0, dtype=torch.float64)).tolist()
+        radii = " ".join(f"{value:.2f}" for value in least)
         beyond = ""
         if any(self.growth):
             each = self.growth[:1] if len(set(self.growth)) == 1 else self.growth
@@ -173,6 +182,8 @@ def calibrate(error: Tensor, distance: Tensor, group: Tensor, source: str) -> Er
     if int((~error.isnan()).sum(0).min()) < LEAST_ROWS:
         return None
     error, distance = error.double(), distance.double()
+    nearest = float(distance.kthvalue(math.ceil(NEAREST * len(distance))).values)
+    distance = distance.clamp(min=nearest)
     growth = [_growth(column[:, None], distance, group) for column in error.unbind(1)]
     scores = error / (1 + distance[:, None] * error.new_tensor(growth))
     fitted = [1 + (each > 0) for each in growth]
@@ -187,6 +198,7 @@ def calibrate(error: Tensor, distance: Tensor, group: Tensor, source: str) -> Er
         len(error),
         len(group.unique()),
         source,
+        nearest if any(growth) else 0.0,
     )
 
 

@@ -158,6 +158,21 @@ def test_a_key_point_with_noise_alone_does_not_grow_with_the_others():
         assert coverage_of(fresh, radius) == pytest.approx(LEVEL, abs=0.02)
 
 
+def test_radii_do_not_fall_nearer_to_the_training_than_the_scored_rows():
+    """Groups that were left out are all at a distance: nothing is known of smaller ones."""
+    error, far, group = distances_of_runs(16, 5, 30.0)
+    far = 0.3 + 0.7 * far
+    found = calibrate(error, far, group, "s")
+    assert min(found.growth) > 0
+    ordered = far.sort().values
+    assert ordered[79] <= found.nearest <= ordered[81], "5 % of 1,600 rows are nearer"
+    places = torch.tensor([0.0, found.nearest, 0.9], dtype=torch.float64)
+    near, at, beyond = found.radius_mm(places)
+    assert torch.equal(near, at)
+    assert (beyond > at).all()
+    assert f"{float(near[0]):.2f} {float(near[1]):.2f} mm" in found.sentence()
+
+
 def test_a_fitted_growth_takes_a_degree_of_freedom():
     error, far, group = distances_of_runs(8, 3, 30.0)
     found = calibrate(error, far, group, "s")

@@ -12,6 +12,7 @@ from surgisoft.report import Picture
 from surgisoft.report.charts import AMBER, BLUE, CHART, GREEN, RED, chart, drawing
 from surgisoft.report.style import INK, MUTED
 from surgisoft.scene.dose_patch import HEALTHY, LESION
+from surgisoft.tasks.episodes.consistency import LARGEST_MM
 from surgisoft.tasks.episodes.log import JUMP_MM, EpisodeLog
 
 OFFSET_MM = 2.0
@@ -71,7 +72,8 @@ def error_chart(log: EpisodeLog) -> Picture | None:
     """The distance from the reference over time; with a beam, only while it is on."""
     named = log.measures.get("beam_error_mm")
     error = log.error_mm if named is None else named
-    if not np.isfinite(error).any():
+    error = _drawable(error)
+    if np.isnan(error).all():
         return None
     largest = float(np.nanmax(error))
     with drawing():
@@ -83,6 +85,11 @@ def error_chart(log: EpisodeLog) -> Picture | None:
         axis.set_ylabel("error [mm]")
         axis.set_title("error over time" + (" while the beam is on" if log.beams else ""))
         return chart(figure, "error over time", f"Largest {largest:.3g} mm")
+
+
+def _drawable(lengths_mm: np.ndarray) -> np.ndarray:
+    """Lengths in mm, NaN where they are infinite or larger than anything in a scene."""
+    return np.where(np.abs(lengths_mm) < LARGEST_MM, lengths_mm, np.nan)
 
 
 def progress_chart(log: EpisodeLog) -> Picture | None:
@@ -112,10 +119,13 @@ def clearance_chart(log: EpisodeLog) -> Picture | None:
     """The least clearance over time, with its limit."""
     if log.clearance_mm is None:
         return None
-    least = float(np.nanmin(log.clearance_mm))
+    clearance = _drawable(log.clearance_mm)
+    if np.isnan(clearance).all():
+        return None
+    least = float(np.nanmin(clearance))
     with drawing():
         figure, axis = plt.subplots()
-        axis.plot(log.time_s, log.clearance_mm, c=BLUE, lw=1.2)
+        axis.plot(log.time_s, clearance, c=BLUE, lw=1.2)
         limit = log.limits.get("clearance_mm")
         if limit is not None:
             axis.axhline(limit, c=RED, lw=1.0, ls="--")

@@ -1,10 +1,18 @@
 """Charts of an experiment: what lies between two values, and where an axis ends."""
 
+from types import SimpleNamespace
+
 import numpy as np
+import pytest
 from matplotlib import pyplot as plt
 
 from surgisoft.agents import report_charts
-from surgisoft.agents.report_charts import spread_chart, sweep_chart
+from surgisoft.agents.report_charts import (
+    clearance_chart,
+    error_chart,
+    spread_chart,
+    sweep_chart,
+)
 
 
 def drawn(monkeypatch, call):
@@ -41,6 +49,23 @@ def test_amounts_are_joined_and_the_highest_line_is_inside_the_frame(monkeypatch
     assert low == 0.0
     assert high > 1.03 * 0.98
     assert caption.startswith("Shaded")
+
+
+def test_an_error_without_bound_leaves_a_gap(monkeypatch):
+    """Of a file whose numbers are damaged."""
+    log = SimpleNamespace(
+        measures={"beam_error_mm": np.array([0.5, np.inf, np.nan, 1e300, 0.25])},
+        time_s=np.arange(5.0), beams={"laser": None},
+    )  # fmt: skip
+    axis, caption = drawn(monkeypatch, lambda: error_chart(log))
+    np.testing.assert_array_equal(axis.lines[0].get_ydata(), [0.5, np.nan, np.nan, np.nan, 0.25])
+    assert axis.get_ylim() == (0.0, 1.08 * 0.5)
+    assert caption == "Largest 0.5 mm"
+    log.measures["beam_error_mm"][:] = np.inf
+    assert error_chart(log) is None
+    log.clearance_mm, log.limits = np.array([-np.inf, 3.0, -2.0, np.nan, np.inf]), {}
+    axis, _ = drawn(monkeypatch, lambda: clearance_chart(log))
+    assert axis.get_ylim()[0] == pytest.approx(-2.2)
 
 
 def test_shares_are_drawn_from_0_to_1(monkeypatch):

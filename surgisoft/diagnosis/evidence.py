@@ -182,8 +182,11 @@ class Evidence:
     """Studentised mean over motions of that log gain."""
 
     def to_json(self) -> dict:
-        """Plain values."""
-        return asdict(self)
+        """Plain values; no frequency of a line where there is none, as in evidence of before."""
+        plain = asdict(self)
+        if not self.line_hz:
+            del plain["line_hz"]
+        return plain
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "Evidence":

@@ -65,7 +65,7 @@ def test_own_weight_of_a_rolled_arm_is_called_a_load(arm, turned, tmp_path):
     assert found.verdict.kind != "several"
     assert found.verdict.effects[:1] in ((), ("payload",))
     if found.verdict.kind == "ambiguous":
-        assert f"{found.ranking[0].heldout_rmse_mm:.3g} mm on held-out" in found.verdict.sentence
+        assert f"{found.ranking[0].heldout_rmse_mm:.3g} mm" in found.verdict.sentence
     result = amend(model, [turned], ["payload"])
     assert result.held_out.after < 0.25 * result.held_out.before
     save_model(result.model, tmp_path / "turned", {})

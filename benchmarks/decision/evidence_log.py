@@ -86,7 +86,7 @@ class Labelled:
 
     def to_json(self) -> dict:
         """Plain values, numbers with DIGITS significant digits."""
-        return _rounded(json_safe(asdict(self)))
+        return _rounded(json_safe(asdict(self) | {"evidence": self.evidence.to_json()}))
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "Labelled":

@@ -77,7 +77,8 @@ def part_of(file: str) -> str:
 
 
 NOT_MEASURED = """\
-**Not measured:** the bodies of functions under `@compiled`, which numba turns into machine code:
+**Not measured:** the bodies of functions under `@compiled`, which numba turns into machine code,
+and those of Warp's kernels:
 the interpreter, which counts branches, never runs them. Their tests compare them with other
 calculations: distances, rays and contacts with trimesh and FCL, plants with formulas and
 PyElastica, compiled steps of a model with the same step in torch. What torch exports (TorchScript,

@@ -352,7 +352,8 @@ def test_the_reason_ends_with_one_full_stop(tmp_path, capsys, monkeypatch):
         return SceneCheck((Finding("clearance", "0 mm", "1 mm", False),), None)
 
     monkeypatch.setattr("surgisoft.scene.author.check_scene", refused)
-    assert new(tmp_path / "scene", ellipsoid(tmp_path), "--unit", "mm") == 1
+    place = ("--lesion", 0, 0, 35)  # one place alone is tried
+    assert new(tmp_path / "scene", ellipsoid(tmp_path), "--unit", "mm", *place) == 1
     said = capsys.readouterr().out.splitlines()[-1]
     assert said.endswith("clearance: 0 mm (needs 1 mm).")
 

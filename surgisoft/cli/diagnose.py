@@ -126,7 +126,7 @@ def diagnose(
             before=earlier,
             paired=paired,
             refit=refit,
-            refit_progress=_announced(tell),
+            refit_progress=announced(tell),
             processes=REFIT_PROCESSES,
             predictions=predictions,
             error_mm=model_error,
@@ -174,7 +174,7 @@ def diagnose(
         print(f"next: {following}")
 
 
-def _announced(tell: Progress) -> Progress:
+def announced(tell: Progress) -> Progress:
     """Progress of a fit with the network, which says first that it takes minutes."""
     begun = False
 
@@ -255,7 +255,7 @@ def _show(found) -> None:
         print(f"not testable: {each.effect}: {each.reason}")
     if found.implausible:
         names = ", ".join(found.implausible)
-        print(f"not ranked: {names} (only implausible parameters would explain anything)")
+        print(f"not ranked: {names} (their parameters would be implausible)")
     if found.refit is not None:
         _show_refit(found.refit)
     if found.next_experiment:

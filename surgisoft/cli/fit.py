@@ -1,7 +1,7 @@
 """`surgisoft fit`: fit an arm model to recordings."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -18,6 +18,9 @@ from surgisoft.cli.options import (
 )
 from surgisoft.cli.progress import progress
 from surgisoft.errors import Interrupted
+
+if TYPE_CHECKING:
+    from surgisoft.surrogate.model import Validation
 
 ABOVE_NOISE = 2.0
 """Ratio of the held-out error to the noise from which `fit` advises to try effects with memory."""
@@ -140,11 +143,16 @@ def fit(
         warn(result.interrupted.sentence)
         raise typer.Exit(INTERRUPTED)
     moved = any(recording.kind == "continuous" for recording in train)
-    error = result.model.validation
-    unexplained = error.noise_mm is None or (error.rmse_mm or 0.0) > ABOVE_NOISE * error.noise_mm
-    if not effects and network == "haw_nn" and unexplained and moved:
+    if not effects and network == "haw_nn" and moved and above_noise(result.model.validation):
         files = " ".join(map(str, recordings))
+        files += " --actuation commanded" if actuation == "commanded" else ""
         again = with_effect_files(f"surgisoft fit {files} --effects auto -o {output}_with_effects")
         print(f"next, whether the arm has memory that this model lacks: {again}")
     following = with_effect_files(f"surgisoft compare {output} TEST.parquet --test --report PAGE")
     print(f"next, its error on an unseen recording: {following}")
+
+
+def above_noise(error: "Validation") -> bool:
+    """Whether a model's held-out error is well above the noise of the cameras, or that is not
+    known."""
+    return error.noise_mm is None or (error.rmse_mm or 0.0) > ABOVE_NOISE * error.noise_mm

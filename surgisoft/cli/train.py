@@ -154,8 +154,8 @@ def train(
         bool,
         typer.Option(
             "--compile",
-            help="Build the loss of an update by torch.compile, which needs a C++ compiler, on "
-            "CUDA Triton; worth it for few --envs (docs/train.md).",
+            help="Compile the loss of an update with torch.compile. This needs a C++ compiler, or "
+            "Triton with --device cuda, and pays with few --envs (docs/training.md).",
         ),
     ] = False,
     logger: Annotated[

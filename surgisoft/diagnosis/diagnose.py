@@ -203,8 +203,7 @@ class Diagnosis:
     not_testable: tuple[NotTestable, ...] = ()
     """Effects that these recordings cannot show; they are not ranked."""
     implausible: tuple[str, ...] = ()
-    """Effects that explain nothing with parameters in their plausible ranges; they are not
-    ranked."""
+    """Effects that would need parameters outside of their plausible ranges; they are not ranked."""
     probabilities: Probabilities | None = None
     """Calibrated probabilities of what is true."""
     next_command: str = ""

@@ -10,10 +10,13 @@ import pytest
 
 from surgisoft.agents.rig_check import Differences, RigCheck
 from surgisoft.cli import run
+from surgisoft.cli.diagnose import announced
+from surgisoft.cli.fit import above_noise
 from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Ranked, Verdict
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import Recording, save_recording
 from surgisoft.surrogate.checkpoint import load_model, save_model
+from surgisoft.surrogate.model import Validation
 
 NAN = float("nan")
 
@@ -196,6 +199,21 @@ def test_diagnose_prints_what_mends_a_set_up(bench, tmp_path, capsys, monkeypatc
     assert not (tmp_path / "a.rrd").exists()
 
 
+@pytest.mark.parametrize(("noise", "above"), [(None, True), (0.4, True), (0.6, False)])
+def test_effects_are_advised_where_the_error_is_above_twice_the_noise(noise, above):
+    assert above_noise(Validation(1.0, noise_mm=noise)) is above
+
+
+def test_a_fit_with_the_network_is_announced_once(capsys):
+    told = []
+    report = announced(lambda done, total, note="": told.append((done, note)))
+    report(1.0, 3.0, "a")
+    report(2.0, 3.0)
+    assert told == [(1.0, "a"), (2.0, "")]
+    said = capsys.readouterr().err
+    assert said.count("which takes minutes; --refit never skips it") == 1
+
+
 def test_diagnose_prints_candidates_and_the_next_step(bench, capsys, monkeypatch):
     row = SimpleNamespace(
         effect="creep", ci95=(0.1, 0.2), confidence=0.9, gain_alone=0.5, gain_unique=0.25,
@@ -225,7 +243,7 @@ def test_diagnose_prints_candidates_and_the_next_step(bench, capsys, monkeypatch
     assert "check: the clock is even\n" in out
     assert re.search(r"creep +0\.90 +50\.0% +25\.0% +0\.1500 \[0\.1000, 0\.2000\] mm", out)
     assert "not testable: drift: too short" in out
-    assert "not ranked: payload, twist (only implausible parameters would expl" in out
+    assert "not ranked: payload, twist (their parameters would be implausible)" in out
     assert "fitted together with the network, because a lag is close:" in out
     assert re.search(r"lag .*\[0\.0100, 0\.0200\] mm +0\.0100  implausible parameters\n", out)
     assert "not tried, because steady-state samples cannot show them: leak\n" in out

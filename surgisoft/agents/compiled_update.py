@@ -10,14 +10,13 @@ import os
 import shutil
 from collections.abc import Callable
 from importlib.util import find_spec
-from typing import Any, cast
+from typing import Any
 
 import torch
 from rsl_rl.algorithms import PPO
-from rsl_rl.models import MLPModel
 from torch import Tensor, nn
 
-from surgisoft.agents.policy_network import ActionNoise, divergence, entropy, log_likelihood
+from surgisoft.agents.ppo_loss import PPOLoss
 from surgisoft.agents.shared_ppo import SharedPPO, adapt_rate, adapts_rate
 from surgisoft.errors import InputError
 from surgisoft.graphs import reason_of
@@ -56,7 +55,7 @@ def compiled_update(ppo: PPO) -> Callable[[], dict[str, float]]:
     check_compiler(device)
     cuda = device.type == "cuda"
     compiled = torch.compile(
-        _Loss(ppo), fullgraph=True, dynamic=False, mode="reduce-overhead" if cuda else None
+        PPOLoss(ppo), fullgraph=True, dynamic=False, mode="reduce-overhead" if cuda else None
     )
     built = False
 
@@ -103,52 +102,6 @@ def _by_rows(plain: Callable[..., Any], count: int) -> Callable[..., Any]:
         return (fast if len(action) == count else plain)(stream, part, action, dt_s)
 
     return step
-
-
-class _Loss(nn.Module):
-    """rsl-rl's losses of a minibatch as one function of tensors."""
-
-    def __init__(self, ppo: PPO):
-        super().__init__()
-        self.actor, self.critic = ppo.actor, ppo.critic
-        self.noise = cast(ActionNoise, ppo.actor.distribution)
-        self.clip, self.value_weight = ppo.clip_param, ppo.value_loss_coef
-        self.entropy_weight = ppo.entropy_coef
-
-    def forward(
-        self,
-        seen: Tensor,
-        seen_by_critic: Tensor,
-        actions: Tensor,
-        old_values: Tensor,
-        advantages: Tensor,
-        returns: Tensor,
-        old_log_likelihood: Tensor,
-        old_mean: Tensor,
-        old_deviation: Tensor,
-    ) -> tuple[Tensor, ...]:
-        """Loss, and its parts: of values, of actions, entropy; divergence from the old policy."""
-        mean = _outputs(self.actor, seen)
-        deviation = self.noise.deviation()
-        values = _outputs(self.critic, seen_by_critic)
-        ratio = (log_likelihood(actions, mean, deviation) - old_log_likelihood.squeeze(-1)).exp()
-        gain = -advantages.squeeze(-1)
-        bounded = ratio.clamp(1.0 - self.clip, 1.0 + self.clip)
-        surrogate = torch.max(gain * ratio, gain * bounded).mean()
-        near = old_values + (values - old_values).clamp(-self.clip, self.clip)
-        value = torch.max((values - returns).pow(2), (near - returns).pow(2)).mean()
-        chaos = entropy(deviation)
-        loss = surrogate + self.value_weight * value - self.entropy_weight * chaos
-        apart = divergence(old_mean, old_deviation[0], mean.detach(), deviation.detach())
-        return loss, value.detach(), surrogate.detach(), chaos.detach(), apart.mean()
-
-
-def _outputs(network: MLPModel, seen: Tensor) -> Tensor:
-    """Outputs of a network by its layers, which torch.compile sees through."""
-    value = network.obs_normalizer(seen)
-    for layer in network.mlp:
-        value = layer(value)
-    return value
 
 
 def _update(ppo: PPO, losses: Callable[[Any], tuple[Tensor, ...]]) -> dict[str, float]:

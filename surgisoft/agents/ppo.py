@@ -26,6 +26,7 @@ from torch import Tensor
 from surgisoft.agents.compiled_network import CompiledNetwork
 from surgisoft.agents.compiled_update import compiled_update
 from surgisoft.agents.distributed import Processes
+from surgisoft.agents.graphed_update import GraphedUpdate
 from surgisoft.agents.policy_network import (
     compile_network,
     network_config,
@@ -106,6 +107,8 @@ def make_ppo(env: JointEnv, preset: Preset, processes: Processes) -> dict[str, P
             ppo.talk_once()
         if preset.compile:
             ppo.update = compiled_update(ppo)
+        elif torch.device(ppo.device).type == "cuda" and processes.count == 1:
+            ppo.update = GraphedUpdate(ppo)
         ppo.train_mode()
         by_agent[agent] = ppo
     return by_agent

@@ -14,6 +14,7 @@ from surgisoft.errors import InputError, Interrupted
 from surgisoft.progress import Progress, silent
 from surgisoft.tasks.base import Episodes, Outcome, Task, TaskState
 from surgisoft.tasks.episodes.log import EpisodeLog, EpisodeRecorder
+from surgisoft.tasks.graphed import donated_episodes
 from surgisoft.tasks.world.pytree import rows
 from surgisoft.threads import rows_on_threads
 
@@ -154,8 +155,8 @@ def _rolled_out(
     report: Callable[[int], None],
     watch: Callable[[Instant], None] | None,
 ) -> Rollout:
-    """Episodes `first` to `first + count - 1` side by side; finished ones leave the batch."""
-    runner, device = Episodes(task, donate=True), task.world.device
+    """Episodes `first` to `first + count - 1` side by side; on a CPU finished ones leave the batch."""
+    runner, device = donated_episodes(task, count), task.world.device
     state = runner.seeded(seed, count, first)
     at = torch.arange(count, device=device)
     live = torch.ones(count, dtype=torch.bool, device=device)
@@ -184,7 +185,7 @@ def _rolled_out(
         remaining = live.nonzero()[:, 0]
         if not len(remaining):
             break
-        if 2 * len(remaining) <= len(live):
+        if isinstance(runner, Episodes) and 2 * len(remaining) <= len(live):
             state, at, live = rows(state, remaining), at[remaining], live[remaining]
     report(task.steps)
     measures = {name: _padded(torch.stack(trace), task.steps) for name, trace in traces.items()}

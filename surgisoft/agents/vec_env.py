@@ -17,7 +17,8 @@ from torch import Tensor
 
 from surgisoft.errors import InputError
 from surgisoft.memory import keep_freed_memory
-from surgisoft.tasks.base import Episodes, Task
+from surgisoft.tasks.base import Task
+from surgisoft.tasks.graphed import donated_episodes
 from surgisoft.tasks.world.arm import ArmPart, ModelArm
 
 STATE = "state"
@@ -67,7 +68,7 @@ class JointEnv:
         keep_freed_memory()
         self.task, self.num_envs, self.action_kPa = task, count, action_kPa
         self.privileged = privileged
-        self.episodes = Episodes(task, donate=True)
+        self.episodes = donated_episodes(task, count)
         with torch.inference_mode():
             state = self.episodes.seeded(seed, count, first)
             # Else all episodes would be over in the same step for ever.

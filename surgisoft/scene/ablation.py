@@ -18,6 +18,7 @@ import torch
 
 from surgisoft.compiled import compiled
 from surgisoft.errors import InputError
+from surgisoft.on_device import on_device
 from surgisoft.scene.batched import default_engine
 from surgisoft.scene.dose_patch import HEALTHY, LESION, RING, SPACING_WAISTS, DosePatch, samples_at
 from surgisoft.threads import over_rows
@@ -227,17 +228,18 @@ class AblationMap:
     def reset(
         self,
         state: AblationState,
-        mask: torch.Tensor,
+        index: torch.Tensor,
         point_mm: torch.Tensor,
         direction: torch.Tensor,
         on: torch.Tensor,
         in_place: bool = False,
         ring: torch.Tensor | None = None,
     ) -> AblationState:
-        """Fresh tissue where mask (B,) is set; the beam and the ring as for `start`.
+        """Fresh tissue in environments index (R,) int64; the beam and the ring as for `start`.
 
         With in_place the old state's tensors are overwritten.
         """
+        mask = torch.zeros_like(state.ring, dtype=torch.bool).index_fill_(0, index, True)
         new = self._beam(point_mm, direction, on)
         old = (state.last_point_mm, state.last_direction, state.last_on)
         beam = (
@@ -247,7 +249,6 @@ class AblationMap:
         kept = [getattr(state, name) for name in _SUMS]
         if in_place:
             # By index: a mask would be spread over every sample of every environment first.
-            index = mask.nonzero()[:, 0]
             for tensor in kept:
                 tensor.index_fill_(0, index, 0.0)
         else:
@@ -274,7 +275,7 @@ class AblationMap:
         the old state's tensors are overwritten.
         """
         point, aim, on = self._beam(point_mm, direction, on)
-        power = torch.as_tensor(power_w, dtype=torch.float32, device=self.device)
+        power = on_device(power_w, self._ring_mm)
         both, one = on & state.last_on, on ^ state.last_on
         energy = torch.where(both, 1.0, torch.where(one, 0.5, 0.0)) * power * dt_s
         energy = torch.where(energy > 0.0, energy, 0.0)

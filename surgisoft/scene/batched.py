@@ -22,7 +22,14 @@ import torch
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.scene import frames
 from surgisoft.scene.bvh import TriangleTree, build_tree
-from surgisoft.scene.capsules import HORIZON_MM, BatchClearance, chain_normal, self_contact_gap_mm
+from surgisoft.scene.capsules import (
+    HORIZON_MM,
+    LONGEST_SEGMENT_MM,
+    MOST_PARTS,
+    BatchClearance,
+    chain_normal,
+    self_contact_gap_mm,
+)
 from surgisoft.scene.distance import (
     beams_beside_body,
     beams_beside_chains,
@@ -58,10 +65,6 @@ from surgisoft.threads import over_rows
 
 ENGINES = ("compiled", "torch", "warp")
 """The batched engines: compiled queries, torch alone, or NVIDIA Warp kernels (extra `gpu`)."""
-LONGEST_SEGMENT_MM = 6.0
-"""Longer segments of a centreline are divided before the distance to the bodies is taken (mm)."""
-MOST_PARTS = 256
-"""No segment is cut into more parts than this."""
 SLOPE_MM = 0.05
 """Shift of an arm by which the slope of its distance from a strained body is measured (mm)."""
 BESIDE_MM = 1e-3
@@ -145,7 +148,7 @@ class BatchedScene:
         radii = [self.radius_mm(name) for name in names]
         dtype, count = lines[0].dtype, len(lines[0])
         bodies = torch.empty((count, len(names), len(self.bodies)), dtype=dtype, device=self.device)
-        fine = [refined(line) for line in lines]
+        fine = [self._divided(line) for line in lines]
         for n, (body, surface) in enumerate(zip(self.bodies, self._surfaces, strict=True)):
             turn, shift = self._inward(body, poses)
             for a, ((line, given), radius) in enumerate(zip(fine, radii, strict=True)):
@@ -184,8 +187,7 @@ class BatchedScene:
         count = shape[0]
         origins = _held(origins_mm).double().reshape(count, -1, 3)
         aims = frames.normalise(_held(directions).double()).reshape(count, -1, 3)
-        best = torch.full(origins.shape[:-1], float(range_mm), dtype=torch.float64)
-        best = best.to(self.device)
+        best = torch.full_like(origins[..., 0], float(range_mm))
         struck = torch.zeros_like(best, dtype=torch.int8)
         which = torch.full_like(best, -1, dtype=torch.int32)
         face = torch.full_like(best, -1, dtype=torch.int64)
@@ -378,8 +380,15 @@ class BatchedScene:
         return self._at_home[body.name] if pose is None else self._inverse(pose.detach())
 
     def _inverse(self, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        inward = torch.linalg.inv(pose.to(self.device, torch.float64))
+        # `inv` would wait for an accelerator, to check that the pose has an inverse.
+        inward = torch.linalg.inv_ex(pose.to(self.device, torch.float64))[0]
         return inward[:, :3, :3].contiguous(), inward[:, :3, 3].contiguous()
+
+    def _divided(self, line: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """An arm (B, K, 3) mm as surfaces measure it, and which points (K',) bool are its own."""
+        if any(surface.divides for surface in self._surfaces):
+            return line, torch.ones(line.shape[1], dtype=torch.bool, device=line.device)
+        return refined(line)
 
     def _apart(self, first, second, radii: float) -> torch.Tensor:
         if not self.compiled:
@@ -680,6 +689,8 @@ class Surface(Protocol):
 
     normals: torch.Tensor
     """(F, 3) outward unit normals of the faces, in the body's frame."""
+    divides: bool
+    """Whether `clearance` divides long segments itself."""
 
     def clearance(
         self,
@@ -696,6 +707,8 @@ class Surface(Protocol):
 
 class CompiledSurface:
     """One body's surface on the CPU, for clearance queries."""
+
+    divides = False
 
     def __init__(self, tree: TriangleTree, field: DistanceField, device: str | torch.device):
         self._tree = tree

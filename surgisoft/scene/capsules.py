@@ -18,6 +18,10 @@ from surgisoft.scene.frames import Array, dot, norm, normalise
 
 HORIZON_MM = 60.0
 """Clearances saturate at this value in both engines (mm)."""
+LONGEST_SEGMENT_MM = 6.0
+"""Longer segments of a centreline are divided before the distance to the bodies is taken (mm)."""
+MOST_PARTS = 256
+"""No segment is cut into more parts than this."""
 
 
 @dataclass(frozen=True, eq=False)

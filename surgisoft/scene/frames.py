@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from surgisoft.on_device import on_device
+
 Array = Any
 """A numpy array or a torch tensor; every function returns the type that it is given."""
 
@@ -26,8 +28,14 @@ def _as_arrays(*values):
     tensors = [v for v in values if isinstance(v, torch.Tensor)]
     if tensors:
         like = tensors[0]
-        return [torch.as_tensor(v, dtype=like.dtype, device=like.device) for v in values]
+        return [_as_tensor(v, like) for v in values]
     return [np.asarray(v, dtype=np.float64) for v in values]
+
+
+def _as_tensor(value, like: torch.Tensor) -> torch.Tensor:
+    if isinstance(value, (int, float, torch.Tensor)):
+        return on_device(value, like)
+    return torch.as_tensor(value, dtype=like.dtype, device=like.device)
 
 
 def norm(vector: Array) -> Array:
@@ -62,7 +70,7 @@ def pose_from(rotation: Array, position_mm: Array) -> Array:
     position_mm = lib.broadcast_to(position_mm, (*batch, 3))
     top = lib.concatenate((rotation, position_mm[..., None]), -1)
     bottom = lib.zeros_like(top[..., :1, :])
-    bottom[..., 3] = 1.0
+    bottom[..., 3] += 1.0
     return lib.concatenate((top, bottom), -2)
 
 
@@ -152,7 +160,8 @@ def rotation_from_axis_angle(axis: Array, angle_rad: Array) -> Array:
     u = normalise(axis)
     c, s = lib.cos(angle_rad)[..., None, None], lib.sin(angle_rad)[..., None, None]
     rows = lib.zeros_like(u[..., None] * u[..., None, :])
-    rows[..., 0, 0] = rows[..., 1, 1] = rows[..., 2, 2] = 1.0
+    for k in range(3):
+        rows[..., k, k] += 1.0
     turned = lib.swapaxes(cross(u[..., None, :], rows), -1, -2)
     return c * rows + s * turned + (1.0 - c) * u[..., None] * u[..., None, :]
 

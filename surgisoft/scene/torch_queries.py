@@ -204,6 +204,8 @@ PAIRS_AT_ONCE = 4_000_000
 class TorchSurface:
     """One body's surface on a device: its distance field, tree and normals."""
 
+    divides = False
+
     def __init__(self, tree: TriangleTree, field: DistanceField, device: str | torch.device):
         self._tree = TorchTree(tree, device)
         self._closed = tree.mesh.is_watertight

@@ -302,6 +302,22 @@ def is_inside(
     return inside
 
 
+@wp.func
+def parts_of(p: vec, q: vec, longest: real, most: int) -> int:
+    """Parts into which a segment is divided."""
+    return int(wp.clamp(wp.ceil(wp.length(q - p) / longest), ONE, wp.float64(most)))
+
+
+@wp.func
+def part_end(p: vec, q: vec, n: int, parts: int) -> vec:
+    """End of part n of a segment, 1 to `parts`; the segment's own ends without rounding."""
+    if n == 0:
+        return p
+    if n == parts:
+        return q
+    return p + wp.float64(n) / wp.float64(parts) * (q - p)
+
+
 @wp.kernel
 def chains_to_surface(
     lines: Points2,
@@ -321,53 +337,81 @@ def chains_to_surface(
     starts: Whole,
     lower: Points,
     upper: Points,
-    at_points: Numbers2,
+    longest: real,
+    most: int,
     out: Numbers,
 ):
-    """Clearance of arm `tid` from a body; at_points (B, K) is working memory. See `distance`."""
+    """Clearance of arm `tid` from a body. See `distance`.
+
+    Segments above `longest` mm are divided, into at most `most` parts.
+    """
     b = wp.tid()
     pose = wp.where(turns.shape[0] > 1, b, 0)
     turn = turns[pose]
     shift = shifts[pose]
     count = lines.shape[1]
-    estimate = real(FAR)
+    last = turn * lines[b, 0] + shift
+    finite = wp.isfinite(last[0]) and wp.isfinite(last[1]) and wp.isfinite(last[2])
+    value = field_at(values, origin, cell, last)
+    estimate = real(wp.where(given[0], value, wp.abs(value)))
     lowest = real(FAR)
     first = int(0)
-    finite = bool(True)
-    before = vec(ZERO, ZERO, ZERO)
-    for k in range(count):
-        p = turn * lines[b, k] + shift
-        finite = finite and wp.isfinite(p[0]) and wp.isfinite(p[1]) and wp.isfinite(p[2])
-        value = field_at(values, origin, cell, p)
-        at_points[b, k] = value
-        estimate = wp.min(estimate, wp.where(given[k], value, wp.abs(value)))
-        if k > 0:
-            ends = wp.min(at_points[b, k - 1], band) + wp.min(value, band)
-            low = HALF * (ends - wp.length(p - before)) - slack
+    first_part = int(1)
+    for k in range(count - 1):
+        start = last
+        end = turn * lines[b, k + 1] + shift
+        finite = finite and wp.isfinite(end[0]) and wp.isfinite(end[1]) and wp.isfinite(end[2])
+        parts = parts_of(lines[b, k], lines[b, k + 1], longest, most)
+        for n in range(1, parts + 1):
+            p = part_end(start, end, n, parts)
+            before = value
+            value = field_at(values, origin, cell, p)
+            known = n == parts and given[k + 1]
+            estimate = wp.min(estimate, wp.where(known, value, wp.abs(value)))
+            ends = wp.min(before, band) + wp.min(value, band)
+            low = HALF * (ends - wp.length(p - last)) - slack
             if low < lowest:
                 lowest = low
-                first = k - 1
-        before = p
+                first = k
+                first_part = n
+            last = p
     if not finite:
         out[b] = NONE
         return
     if lowest - radius <= within:
         best = wp.min(estimate + slack, horizon + radius)
-        # The segment with the smallest lower bound goes first: it rules out most of the others.
-        for n in range(count - 1):
-            k = (first + n) % (count - 1)
-            p = turn * lines[b, k] + shift
-            q = turn * lines[b, k + 1] + shift
-            ends = wp.min(at_points[b, k], band) + wp.min(at_points[b, k + 1], band)
-            low = HALF * (ends - wp.length(q - p)) - slack
-            if low < best and best > ZERO:
-                d2 = segment_surface_d2(p, q, best * best, faces, starts, lower, upper)
-                best = wp.min(best, wp.sqrt(d2))
+        # The part with the smallest lower bound goes first: it rules out most of the others.
+        start = turn * lines[b, first] + shift
+        end = turn * lines[b, first + 1] + shift
+        parts = parts_of(lines[b, first], lines[b, first + 1], longest, most)
+        p = part_end(start, end, first_part - 1, parts)
+        q = part_end(start, end, first_part, parts)
+        if lowest < best and best > ZERO:
+            d2 = segment_surface_d2(p, q, best * best, faces, starts, lower, upper)
+            best = wp.min(best, wp.sqrt(d2))
+        last = turn * lines[b, 0] + shift
+        value = field_at(values, origin, cell, last)
+        for k in range(count - 1):
+            start = last
+            end = turn * lines[b, k + 1] + shift
+            parts = parts_of(lines[b, k], lines[b, k + 1], longest, most)
+            for n in range(1, parts + 1):
+                q = part_end(start, end, n, parts)
+                before = value
+                value = field_at(values, origin, cell, q)
+                ends = wp.min(before, band) + wp.min(value, band)
+                low = HALF * (ends - wp.length(q - last)) - slack
+                done = k == first and n == first_part
+                if low < best and best > ZERO and not done:
+                    d2 = segment_surface_d2(last, q, best * best, faces, starts, lower, upper)
+                    best = wp.min(best, wp.sqrt(d2))
+                last = q
         if closed == 1:
             for k in range(count):
-                if given[k] and at_points[b, k] - slack < wp.min(best, ZERO):
-                    p = turn * lines[b, k] + shift
-                    bound = wp.abs(at_points[b, k]) + slack
+                p = turn * lines[b, k] + shift
+                value = field_at(values, origin, cell, p)
+                if given[k] and value - slack < wp.min(best, ZERO):
+                    bound = wp.abs(value) + slack
                     d2 = segment_surface_d2(p, p, bound * bound, faces, starts, lower, upper)
                     depth = wp.sqrt(d2)
                     if is_inside(p, depth, values, origin, cell, faces, starts, lower, upper):

@@ -13,6 +13,7 @@ import torch
 
 from surgisoft.scene import warp_kernels as kernels
 from surgisoft.scene.bvh import TriangleTree
+from surgisoft.scene.capsules import LONGEST_SEGMENT_MM, MOST_PARTS
 from surgisoft.scene.field import DistanceField
 from surgisoft.scene.warp_kernels import wp
 
@@ -36,6 +37,8 @@ def vectors(tensor: torch.Tensor):
 
 class WarpSurface:
     """One body's surface on a device: its distance field, tree and normals."""
+
+    divides = True
 
     def __init__(self, tree: TriangleTree, field: DistanceField, device: str | torch.device):
         def there(array, dtype=torch.float64) -> torch.Tensor:
@@ -84,10 +87,11 @@ class WarpSurface:
     ) -> torch.Tensor:
         """(B,) mm: signed clearance of arms (B, K, 3), world frame, from the surface.
 
-        given (K,) bool: the centreline's own points, where depth inside the body counts.
+        given (K,) bool: the centreline's own points, where depth inside the body counts. Long
+        segments are divided.
         """
         line, turns, shifts = held(lines), held(turn), held(shift)
-        at_points, out = torch.empty_like(line[..., 0]), torch.empty_like(line[:, 0, 0])
+        out = torch.empty_like(line[:, 0, 0])
         arguments = [
             vectors(line),
             wp.from_torch(given.contiguous()),
@@ -97,7 +101,8 @@ class WarpSurface:
             self._closed,
             *self._field,
             *self._tree,
-            wp.from_torch(at_points),
+            float(LONGEST_SEGMENT_MM),
+            MOST_PARTS,
             wp.from_torch(out),
         ]
         launch(kernels.chains_to_surface, len(line), arguments, line)

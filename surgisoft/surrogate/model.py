@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from surgisoft.errors import InputError, counted
+from surgisoft.on_device import on_device
 from surgisoft.surrogate.arm import ArmSpec, ArmState
 from surgisoft.surrogate.backbone import ArcBackbone, Backbone, require_body
 from surgisoft.surrogate.callables.network import CallableNetwork
@@ -251,7 +252,7 @@ class ArmModel(nn.Module):
         Returns the new state and the key points (B, n, 3) in mm, base frame.
         """
         pressure = state.pressure + dp
-        dt = torch.as_tensor(dt, dtype=pressure.dtype, device=pressure.device).expand(len(pressure))
+        dt = on_device(dt, pressure).expand(len(pressure))
         return self.chain.step(state, pressure, Context(dt, None, temperature_C))
 
     def trace(self, history: History) -> Taps:

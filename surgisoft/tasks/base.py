@@ -243,11 +243,14 @@ class Episodes:
     def reset(self, state: TaskState, mask: Tensor) -> TaskState:
         """Start new episodes where mask (B,) is set, each with its random number stream."""
         index = mask.nonzero()[:, 0]
-        if not len(index):
-            return state
+        return self.restarted(state, index) if len(index) else state
+
+    @rows_on_threads()
+    def restarted(self, state: TaskState, index: Tensor) -> TaskState:
+        """Start new episodes in environments index (R,) int64; one may be named more than once."""
         stream, goal = self.task.goal(rows(state.world.stream, index))
         world = replace(state.world, stream=with_rows(state.world.stream, index, stream))
-        return TaskState(self.task.world.reset(world, mask), with_rows(state.goal, index, goal))
+        return TaskState(self.task.world.restarted(world, index), with_rows(state.goal, index, goal))
 
     @rows_on_threads()
     def step(self, state: TaskState, actions: Mapping[str, Tensor]) -> tuple[TaskState, Outcome]:

@@ -18,11 +18,12 @@ from torch import Tensor
 from surgisoft.errors import InputError
 from surgisoft.memory import keep_freed_memory
 from surgisoft.tasks.arguments import actions_of, whole
-from surgisoft.tasks.base import Episodes, Task, TaskState
+from surgisoft.tasks.base import Task, TaskState
+from surgisoft.tasks.graphed import donated_episodes
 from surgisoft.tasks.registry import make_with
 from surgisoft.tasks.world.images import VECTOR, images_of
 from surgisoft.tasks.world.pytree import tree_map
-from surgisoft.tasks.world.random_streams import joined, streams
+from surgisoft.tasks.world.random_streams import episode_streams
 from surgisoft.threads import rows_on_threads
 
 SPREAD = 7919
@@ -69,7 +70,7 @@ class BatchedEnv:
         keep_freed_memory()
         self.task, self.num_envs, self.device = task, num_envs, task.world.device
         self.agents = tuple(task.agents)
-        self._episodes = Episodes(task, donate=True)
+        self._episodes = donated_episodes(task, num_envs)
         self._spread = spread
         world = task.world
         self._images = images_of(world.scene, world.config.endoscope_images, task.name)
@@ -98,8 +99,7 @@ class BatchedEnv:
         """Begin all episodes; environment i has seed + i. Returns the observations, which
         are those of a `BatchedStep`."""
         seed = whole("seed", seed)
-        each = [streams(seed + i, 1, 0, self.device) for i in range(self.num_envs)]
-        state = self._episodes.start(joined(each))
+        state = self._episodes.start(episode_streams(seed, self.num_envs, self.device))
         if self._spread:
             steps = torch.arange(self.num_envs, device=self.device) * SPREAD % self.task.steps
             state = replace(state, world=replace(state.world, steps=steps))

@@ -40,7 +40,7 @@ from surgisoft.tasks.observations import (
 )
 from surgisoft.tasks.trajectories.closed_path import RingCut, point_on_closed
 from surgisoft.tasks.trajectories.routes import RouteProgress
-from surgisoft.tasks.world.arm import ArmPart, as_known
+from surgisoft.tasks.world.arm import ArmPart, as_known, measured_exactly
 from surgisoft.tasks.world.pytree import TensorDataclass
 from surgisoft.tasks.world.random_streams import Stream
 from surgisoft.tasks.world.scene import (
@@ -347,11 +347,7 @@ class LaserTask(ABC, Generic[Progress]):
         arms = state.world.arms
         if state.world.scene.measured:  # an exported controller poses them so
             return arms
-        if all(
-            torch.equal(part.seen_mm, part.points_mm)
-            and (part.known_mount is None or torch.equal(part.known_mount, part.mount))
-            for part in arms.values()
-        ):
+        if all(measured_exactly(self.world.arms[name], part) for name, part in arms.items()):
             return arms
         return {
             name: self.world.arms[name].posed(as_known(part), part.seen_mm)

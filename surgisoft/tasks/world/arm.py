@@ -266,6 +266,23 @@ class Arm(Protocol):
         """(B, m) kPa: the action that brings the chambers to `pressure` (B, m), if in reach."""
 
 
+def measured_exactly(arm: Arm, part: ArmPart) -> bool:
+    """Whether controllers know the body of an arm, in all environments.
+
+    On the CPU the state is asked. On an accelerator that would wait for it, so the configuration
+    is: a simulated arm without noise and observer is known, but for one of a single key point that
+    is mounted off the pose that controllers know.
+    """
+    if part.seen_mm.device.type == "cpu":
+        same = torch.equal(part.seen_mm, part.points_mm)
+        return same and (part.known_mount is None or torch.equal(part.known_mount, part.mount))
+    if part.plant is not None or not isinstance(arm, ModelArm):
+        return False
+    vary = arm.vary
+    on_pose = part.known_mount is None or vary.mount_mm == vary.mount_rad == 0.0
+    return on_pose and arm.observer.raw and vary.noise_mm == 0.0
+
+
 def units_per_kPa(spec: ArmSpec) -> float:
     """The actuation of an arm, in its own unit, that a pressure of 1 kPa of a task stands for.
 

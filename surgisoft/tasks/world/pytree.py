@@ -40,6 +40,18 @@ def tree_map(function: Callable[..., Tensor], tree: Tree, *others: Tree) -> Tree
     return _mapped(function, lambda objects, *_: objects, tree, *others)
 
 
+def leaves(tree: Any) -> list[Tensor]:
+    """The tensors of a pytree, in order."""
+    found: list[Tensor] = []
+
+    def kept(value: Tensor) -> Tensor:
+        found.append(value)
+        return value
+
+    tree_map(kept, tree)
+    return found
+
+
 def rows(tree: Tree, index: Tensor) -> Tree:
     """The environments at index (R,) int64."""
 

@@ -14,6 +14,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from surgisoft.on_device import on_device
 from surgisoft.surrogate.arm import ArmState
 from surgisoft.surrogate.chain import Link, Signal, Stepping
 from surgisoft.surrogate.effects import Context, free_name, make_effect
@@ -109,7 +110,7 @@ class RandomEffects:
         self, state: ArmState, pressure: Tensor, dt_s: Tensor | float, factors: Tensor
     ) -> tuple[ArmState, Tensor]:
         """State and key points (B, n, 3) mm, base frame, after a step to (B, m) kPa."""
-        dt = torch.as_tensor(dt_s, dtype=pressure.dtype, device=pressure.device)
+        dt = on_device(dt_s, pressure)
         mode = ScaledStepping(
             state,
             Context(dt.expand(len(pressure))),

@@ -57,6 +57,12 @@ def streams(seed: int, count: int, first: int = 0, device: str | torch.device = 
     return Stream(_mix(root + _GAMMA * (place + 1)), torch.zeros_like(place))
 
 
+def episode_streams(seed: int, count: int, device: str | torch.device = "cpu") -> Stream:
+    """The first stream of each of the seeds `seed` to `seed + count - 1`."""
+    seeds = torch.arange(count, dtype=torch.int64, device=device) + _wrapped(seed)
+    return Stream(_mix(_mix(seeds) + _GAMMA), torch.zeros_like(seeds))
+
+
 def joined(parts: Sequence[Stream]) -> Stream:
     """Concatenate batches of random number streams."""
     key, count = torch.cat([p.key for p in parts]), torch.cat([p.count for p in parts])

@@ -167,7 +167,7 @@ class OrganMotion:
         c, count = self.config, self.count
         stream, share = stream.uniform(0.0, 1.0, 3)
         stream, spread = stream.normal(2, count)
-        low, high = (torch.tensor(end, device=self.device) for end in c.amplitude_mm)
+        low, high = c.amplitude_mm
         amplitude = low + (high - low) * share[:, 0]
         rate = c.rate_per_min[0] + (c.rate_per_min[1] - c.rate_per_min[0]) * share[:, 1]
         factor = (1.0 + c.irregular * spread).clamp(LEAST_SHARE, MOST_SHARE)

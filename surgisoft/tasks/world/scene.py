@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.on_device import on_device
 from surgisoft.scene.ablation import AblationMap, AblationState, Tissue
 from surgisoft.scene.ablation import RingReport as RingReport
 from surgisoft.scene.batched import BatchedScene
@@ -229,14 +230,14 @@ class SceneEngine:
     def fresh_dose(
         self,
         dose: AblationState,
-        mask: Tensor,
+        index: Tensor,
         scene: SceneState,
         parts: Mapping[str, ArmPart],
     ) -> AblationState:
-        """Replace the tissue by untouched tissue where mask (B,) is set, under the scene's beam."""
+        """Replace the tissue of episodes index (R,) by untouched tissue, under the scene's beam."""
         beams = self._beams(scene, parts)
         in_place = scene.donated and overwritable(dose.dose)
-        return self.ablation.reset(dose, mask, *beams, in_place=in_place, ring=scene.lesion)
+        return self.ablation.reset(dose, index, *beams, in_place=in_place, ring=scene.lesion)
 
     def placement(self, breaths: Breaths | None, ahead_s: float = 0.0) -> Placement | None:
         """Where the moving bodies are, `ahead_s` seconds from now; None where nothing moves."""
@@ -325,7 +326,7 @@ class SceneEngine:
 
     def _lit(self, power: float | Tensor, like: Tensor) -> dict[str, Tensor]:
         """Whether each laser burns with a power as `_power` gives it; `like` is (B,)."""
-        on = torch.as_tensor(power, device=self.device) > 0.0
+        on = on_device(power, self.centre_mm) > 0.0
         on = on if on.ndim == 2 else on.expand(len(like))[:, None]
         return dict(zip(self.lasers, on.unbind(1), strict=True))
 
@@ -337,7 +338,7 @@ class SceneEngine:
             each = [power_w.get(name, 0.0) for name in self.lasers]
         if len(each) == 1:
             return each[0]
-        held = (torch.as_tensor(one, dtype=torch.float32, device=self.device) for one in each)
+        held = (on_device(one, self.centre_mm) for one in each)
         return torch.stack([one.expand(len(like)) for one in held], 1)
 
 

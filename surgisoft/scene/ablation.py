@@ -228,18 +228,17 @@ class AblationMap:
     def reset(
         self,
         state: AblationState,
-        index: torch.Tensor,
+        mask: torch.Tensor,
         point_mm: torch.Tensor,
         direction: torch.Tensor,
         on: torch.Tensor,
         in_place: bool = False,
         ring: torch.Tensor | None = None,
     ) -> AblationState:
-        """Fresh tissue in environments index (R,) int64; the beam and the ring as for `start`.
+        """Fresh tissue where mask (B,) is set; the beam and the ring as for `start`.
 
         With in_place the old state's tensors are overwritten.
         """
-        mask = torch.zeros_like(state.ring, dtype=torch.bool).index_fill_(0, index, True)
         new = self._beam(point_mm, direction, on)
         old = (state.last_point_mm, state.last_direction, state.last_on)
         beam = (
@@ -249,6 +248,7 @@ class AblationMap:
         kept = [getattr(state, name) for name in _SUMS]
         if in_place:
             # By index: a mask would be spread over every sample of every environment first.
+            index = mask.nonzero()[:, 0]
             for tensor in kept:
                 tensor.index_fill_(0, index, 0.0)
         else:

@@ -243,14 +243,11 @@ class Episodes:
     def reset(self, state: TaskState, mask: Tensor) -> TaskState:
         """Start new episodes where mask (B,) is set, each with its random number stream."""
         index = mask.nonzero()[:, 0]
-        return self.restarted(state, index) if len(index) else state
-
-    @rows_on_threads()
-    def restarted(self, state: TaskState, index: Tensor) -> TaskState:
-        """Start new episodes in environments index (R,) int64; one may be named more than once."""
+        if not len(index):
+            return state
         stream, goal = self.task.goal(rows(state.world.stream, index))
         world = replace(state.world, stream=with_rows(state.world.stream, index, stream))
-        return TaskState(self.task.world.restarted(world, index), with_rows(state.goal, index, goal))
+        return TaskState(self.task.world.reset(world, mask), with_rows(state.goal, index, goal))
 
     @rows_on_threads()
     def step(self, state: TaskState, actions: Mapping[str, Tensor]) -> tuple[TaskState, Outcome]:
@@ -265,6 +262,14 @@ class Episodes:
         terminated = task.ended(state) | failed
         truncated = (state.world.steps >= task.steps) & ~terminated
         return state, Outcome(terms, terminated, truncated, task.measures(state))
+
+    def observe_anew(
+        self, state: TaskState, index: Tensor, seen: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
+        """Observations as `observe` gives them, where only episodes index (R,) int64 are not those
+        in which `seen` was observed."""
+        fresh = self.observe(rows(state, index))
+        return {agent: old.index_copy(0, index, fresh[agent]) for agent, old in seen.items()}
 
     @rows_on_threads()
     def observe(self, state: TaskState) -> dict[str, Tensor]:

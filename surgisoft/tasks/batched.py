@@ -114,13 +114,15 @@ class BatchedEnv:
         held = actions_of(actions, shapes, self.device)
         state, outcome = self._episodes.step(self._now, held)
         images = self._drawn(state)
-        final = self._with_images(self._episodes.observe(state), images)
+        vectors = self._episodes.observe(state)
+        final = self._with_images(vectors, images)
         now = self._state = self._episodes.reset(state, outcome.done)
         index, seen = outcome.done.nonzero()[:, 0], final
         if len(index):
             if self._images is not None:
                 images = self._images.renewed(images, now.world.arms, now.world.scene, index)
-            seen = self._with_images(self._episodes.observe(now), images)
+            vectors = self._episodes.observe_anew(now, index, vectors)
+            seen = self._with_images(vectors, images)
         return BatchedStep(
             observations=seen,
             rewards=outcome.rewards,

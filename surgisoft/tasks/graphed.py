@@ -8,8 +8,9 @@ over it. The operations are those of `Episodes`, and so are the results.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from surgisoft.cuda_graph import cuda_graph, recorded
 from surgisoft.tasks.base import Episodes, Outcome, Task, TaskState
-from surgisoft.tasks.world.pytree import leaves, tree_map
+from surgisoft.tasks.world.pytree import leaves, rows, tree_map
 from surgisoft.tasks.world.random_streams import Stream, streams
 
 Tree = TypeVar("Tree")
@@ -44,7 +45,7 @@ class GraphedEpisodes:
         self.task, self.count = task, count
         self._plain, self._record = Episodes(task, donate=True), record
         self._state: TaskState | None = None
-        self._work: dict[Any, Callable[[], Any]] = {}
+        self._work: dict[tuple, Callable[[], Any]] = {}
         device = task.world.device
         self._actions = {
             agent: torch.zeros(count, task.world.arms[agent].chambers, device=device)
@@ -67,30 +68,52 @@ class GraphedEpisodes:
         held = self._held(state)
         for agent, action in actions.items():
             self._actions[agent].copy_(action)
-        return held, self._done("step", self._stepped).copied()
+        return held, self._done(("step",), self._stepped).copied()
 
     @torch.inference_mode()
     def reset(self, state: TaskState, mask: Tensor) -> TaskState:
         """Start new episodes where mask (B,) is set, each with its random number stream."""
-        held, index = self._held(state), mask.nonzero()[:, 0]
-        if not len(index):
-            return held
+        held = self._held(state)
+        for part, places in self._parts(mask.nonzero()[:, 0]):
+            self._done(("reset", len(places)), partial(self._restarted, places))
+        return held
+
+    @torch.inference_mode()
+    def observe_anew(
+        self, state: TaskState, index: Tensor, seen: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
+        """Observations as `observe` gives them, where only episodes index (R,) int64 are not those
+        in which `seen` was observed."""
+        held, found = self._held(state), dict(seen)
+        for part, places in self._parts(index):
+            name = ("observe", len(places))
+            fresh = self._done(name, partial(self._observed, held, places))
+            for agent, value in fresh.items():
+                found[agent] = found[agent].index_copy(0, part, value[: len(part)])
+        return found
+
+    def _parts(self, index: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+        """Parts of an index, and each in a tensor of one of a few lengths, where graphs find it.
+
+        What is left of its length names the part's first episode again.
+        """
         most = LEAST_ROWS
         while most < min(len(index), self.count):
             most *= 8
         most = min(most, self.count)
-        for part in index.split(most):
-            places = self._index.setdefault(most, torch.zeros_like(part).repeat(most)[:most])
-            places.copy_(part[:1].expand(most))  # those beyond name the first one again
+        for part in index.split(most) if len(index) else ():
+            if most not in self._index:
+                self._index[most] = part.new_zeros(most)
+            places = self._index[most]
+            places.copy_(part[:1].expand(most))
             places[: len(part)].copy_(part)
-            self._done(most, lambda: self._restarted(places))
-        return held
+            yield part, places
 
     @torch.inference_mode()
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         """Clipped observations, agent -> (B, D), see `Episodes.observe`."""
         held = self._held(state)
-        seen = self._done("observe", lambda: self._plain.observe(held))
+        seen = self._done(("observe",), partial(self._plain.observe, held))
         return {agent: value.clone() for agent, value in seen.items()}
 
     def _stepped(self) -> Any:
@@ -100,13 +123,18 @@ class GraphedEpisodes:
         return packed
 
     def _restarted(self, index: Tensor) -> None:
-        _overwrite(self._now, self._plain.restarted(self._now, index))
+        fresh = self._plain.start(rows(self._now.world.stream, index))
+        for old, new in zip(leaves(self._now), leaves(fresh), strict=True):
+            old.index_copy_(0, index, new)
 
-    def _done(self, name: Any, work: Callable[[], Any]) -> Any:
+    def _observed(self, state: TaskState, index: Tensor) -> dict[str, Tensor]:
+        return self._plain.observe(rows(state, index))
+
+    def _done(self, name: tuple, work: Callable[[], Any]) -> Any:
         """The results of a recorded function, which is recorded at its first call."""
         if name not in self._work:
             before = tree_map(torch.clone, self._now)
-            what = f"{name if isinstance(name, str) else 'reset'} of {self.task.name}"
+            what = f"{name[0]} of {self.task.name}"
             self._work[name] = recorded(
                 work,
                 lambda: _overwrite(self._now, before),

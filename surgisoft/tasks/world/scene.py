@@ -230,14 +230,14 @@ class SceneEngine:
     def fresh_dose(
         self,
         dose: AblationState,
-        index: Tensor,
+        mask: Tensor,
         scene: SceneState,
         parts: Mapping[str, ArmPart],
     ) -> AblationState:
-        """Replace the tissue of episodes index (R,) by untouched tissue, under the scene's beam."""
+        """Replace the tissue by untouched tissue where mask (B,) is set, under the scene's beam."""
         beams = self._beams(scene, parts)
         in_place = scene.donated and overwritable(dose.dose)
-        return self.ablation.reset(dose, index, *beams, in_place=in_place, ring=scene.lesion)
+        return self.ablation.reset(dose, mask, *beams, in_place=in_place, ring=scene.lesion)
 
     def placement(self, breaths: Breaths | None, ahead_s: float = 0.0) -> Placement | None:
         """Where the moving bodies are, `ahead_s` seconds from now; None where nothing moves."""

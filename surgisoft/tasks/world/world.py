@@ -184,16 +184,14 @@ class World:
     def reset(self, state: WorldState, mask: Tensor) -> WorldState:
         """Restart the environments where mask (B,) is set, each with its random number stream."""
         index = mask.nonzero()[:, 0]
-        return self.restarted(state, index) if len(index) else state
-
-    def restarted(self, state: WorldState, index: Tensor) -> WorldState:
-        """Restart environments index (R,) int64; one may be named more than once."""
+        if not len(index):
+            return state
         dose, state = state.scene.dose, _without_dose(state)
         fresh = _without_dose(self.start(rows(state.stream, index)))
         state = with_rows(state, index, fresh)
         if dose is None or not isinstance(self.scene, SceneEngine):
             return state
-        dose = self.scene.fresh_dose(dose, index, state.scene, state.arms)
+        dose = self.scene.fresh_dose(dose, mask, state.scene, state.arms)
         return replace(state, scene=replace(state.scene, dose=dose))
 
     def step(

@@ -161,6 +161,16 @@ class RolloutMeans:
     episodes: int
     """Episodes that came to their end."""
 
+    @classmethod
+    def of(cls, means: dict[str, float], rows: int) -> RolloutMeans:
+        """From means by the names `reward/AGENT`, `term/AGENT/TERM`, `measure/NAME` and `done`, over
+        so many rows."""
+
+        def part(prefix: str) -> dict[str, float]:
+            return {n.removeprefix(prefix): v for n, v in means.items() if n.startswith(prefix)}
+
+        return cls(part("reward/"), part("term/"), part("measure/"), round(means["done"] * rows))
+
 
 @torch.inference_mode()
 @rows_on_threads()
@@ -191,12 +201,7 @@ def collect_rollout(env: JointEnv, agents: dict[str, PPO], seen: TensorDict, ste
     for agent, ppo in agents.items():
         ppo.compute_returns(seen.select(*groups[agent]))
     means = {name: _mean(values) for name, values in notes.items()}
-
-    def part(prefix: str) -> dict[str, float]:
-        return {n.removeprefix(prefix): v for n, v in means.items() if n.startswith(prefix)}
-
-    ended = int(torch.stack(notes["done"]).sum())
-    return seen, RolloutMeans(part("reward/"), part("term/"), part("measure/"), ended)
+    return seen, RolloutMeans.of(means, steps * env.num_envs)
 
 
 def _mean(values: list[Tensor]) -> float:

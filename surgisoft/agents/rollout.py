@@ -155,7 +155,8 @@ def _rolled_out(
     report: Callable[[int], None],
     watch: Callable[[Instant], None] | None,
 ) -> Rollout:
-    """Episodes `first` to `first + count - 1` side by side; on a CPU finished ones leave the batch."""
+    """Episodes `first` to `first + count - 1` side by side. Finished ones leave the batch, except
+    where a CUDA graph steps it."""
     runner, device = donated_episodes(task, count), task.world.device
     state = runner.seeded(seed, count, first)
     at = torch.arange(count, device=device)

@@ -24,10 +24,11 @@ from torch import Tensor
 from surgisoft.agents.actor import ScaledActor
 from surgisoft.agents.compiled_update import CompileFailed, compile_arms
 from surgisoft.agents.distributed import Processes
+from surgisoft.agents.graphed_rollout import rollouts
 from surgisoft.agents.learned import ActorPolicy, agent_sizes, check_weights
 from surgisoft.agents.loggers import TENSORBOARD, LoggerFailed, open_writer
 from surgisoft.agents.policy_network import acting
-from surgisoft.agents.ppo import RolloutMeans, collect_rollout, make_ppo, set_noise, update
+from surgisoft.agents.ppo import RolloutMeans, make_ppo, set_noise, update
 from surgisoft.agents.presets import Plan
 from surgisoft.agents.run_folder import BEST, LAST, RunFolder, create_run, damaged
 from surgisoft.agents.selection import evaluate_checkpoint, is_better
@@ -96,6 +97,7 @@ class Training:
             torch.manual_seed(plan.seed + rank * _FAR)
             for ppo in self.agents.values():
                 ppo.broadcast_parameters()
+        self._rolled_out = rollouts(self.env, self.agents, preset.rollout)
         self.seen = self.env.get_observations()
         self.iteration, self.clock = 0, Clock()
         self.best: dict[str, float] | None = None
@@ -119,7 +121,7 @@ class Training:
         preset = self.plan.preset
         for ppo in self.agents.values():
             set_noise(ppo, preset, self.share)
-        self.seen, gathered = collect_rollout(self.env, self.agents, self.seen, preset.rollout)
+        self.seen, gathered = self._rolled_out(self.seen)
         losses = {}
         for agent, ppo in self.agents.items():
             for name, value in update(ppo).items():

@@ -79,7 +79,10 @@ class JointEnv:
     def get_observations(self) -> TensorDict:
         """Agent -> (B, D), and `STATE` -> (B, sum of D, or more where it is privileged); new
         tensors each time."""
-        seen = self.episodes.observe(self.state)
+        return self.grouped(self.episodes.observe(self.state))
+
+    def grouped(self, seen: Mapping[str, Tensor]) -> TensorDict:
+        """Groups of observations from those of the agents in the present state."""
         joint = [seen[agent] for agent in self.task.agents]
         if self.privileged:
             arms = self.task.world.arms

@@ -117,7 +117,7 @@ class BatchedScene:
             raise unknown_name("geometry engine", engine, ENGINES)
         if engine == "compiled" and self.device.type != "cpu":
             raise InputError(f"the compiled engine runs on the CPU, not on '{self.device}'")
-        self.compiled = engine == "compiled"
+        self.engine, self.compiled = engine, engine == "compiled"
         kind, *self._of_chains = _queries(engine)
         self._surfaces: list[Any] = []
         self._trees: list[TriangleTree] = []
@@ -147,6 +147,8 @@ class BatchedScene:
         lines = [_held(arms[name]) for name in names]
         radii = [self.radius_mm(name) for name in names]
         dtype, count = lines[0].dtype, len(lines[0])
+        if self.engine == "warp":  # its kernels take float64; once is enough
+            lines = [line.double() for line in lines]
         bodies = torch.empty((count, len(names), len(self.bodies)), dtype=dtype, device=self.device)
         fine = [self._divided(line) for line in lines]
         for n, (body, surface) in enumerate(zip(self.bodies, self._surfaces, strict=True)):
@@ -164,9 +166,8 @@ class BatchedScene:
         ]
         own = [self._folded(line, radius) for line, radius in zip(lines, radii, strict=True)]
         nothing = torch.empty((count, 0), dtype=dtype, device=self.device)
-        return BatchClearance(
-            bodies, torch.stack(pairs, 1) if pairs else nothing, torch.stack(own, 1)
-        )
+        apart = torch.stack(pairs, 1).to(dtype) if pairs else nothing
+        return BatchClearance(bodies, apart, torch.stack(own, 1).to(dtype))
 
     def cast(
         self,
@@ -183,6 +184,8 @@ class BatchedScene:
         """
         if self.compiled:
             return self._compiled_cast(origins_mm, directions, range_mm, arms or {}, own, poses)
+        if self.engine == "warp":
+            return self._warp_cast(origins_mm, directions, range_mm, arms or {}, own, poses)
         shape = origins_mm.shape[:-1]
         count = shape[0]
         origins = _held(origins_mm).double().reshape(count, -1, 3)
@@ -196,7 +199,6 @@ class BatchedScene:
             turn, shift = self._inward(body, poses)
             o = origins @ turn.mT + shift[:, None]
             d = aims @ turn.mT
-            assert not isinstance(surface, CompiledSurface), "the compiled engine has its own loops"
             t, f = surface.first_hit(o.reshape(-1, 3), d.reshape(-1, 3), float(range_mm))
             t, f = t.view_as(best), f.view_as(best)
             nearer = (f >= 0) & (t < best)
@@ -209,8 +211,7 @@ class BatchedScene:
         for name, line in (arms or {}).items():
             radius, line = self.radius_mm(name), _held(line)
             gap = self_contact_gap_mm(radius) if name == own else -1.0
-            to_chains = self._of_chains[2]
-            t, segment = to_chains(origins, aims, line, radius, gap, best)
+            t, segment = rays_to_chains_torch(origins, aims, line, radius, gap, best)
             nearer = t < best
             point = origins + t[..., None] * aims
             outward = chain_normal(point, line.double()[:, None], segment)
@@ -230,6 +231,31 @@ class BatchedScene:
             point_mm=point.to(dtype).reshape(*shape, 3),
             normal=normal.to(dtype).reshape(*shape, 3),
             incidence_rad=torch.atan2(sine, cosine).to(dtype).reshape(shape),
+        )
+
+    def _warp_cast(self, origins_mm, directions, range_mm, arms, own, poses) -> RayHit:
+        """`cast` by a kernel for each body and each arm."""
+        from surgisoft.scene.warp_queries import WarpRays
+
+        shape, dtype = origins_mm.shape[:-1], origins_mm.dtype
+        flat = (t.detach().reshape(-1, 3) for t in (origins_mm, directions))
+        rays = WarpRays(*flat, range_mm, math.prod(shape[1:]))
+        for n, (body, surface) in enumerate(zip(self.bodies, self._surfaces, strict=True)):
+            surface.cast(rays, *self._inward(body, poses), n, int(struck_of(body)))
+        for name, line in arms.items():
+            radius = self.radius_mm(name)
+            gap = self_contact_gap_mm(radius) if name == own else -1.0
+            kind = Struck.OWN_ARM if name == own else Struck.OTHER_ARM
+            rays.meet(line, radius, gap, int(kind))
+        point, incidence = rays.ends()
+        return RayHit(
+            struck=rays.struck.reshape(shape),
+            body=rays.body.reshape(shape),
+            face=rays.face.reshape(shape),
+            distance_mm=rays.distance_mm.to(dtype).reshape(shape),
+            point_mm=point.to(dtype).reshape(*shape, 3),
+            normal=rays.normals.to(dtype).reshape(*shape, 3),
+            incidence_rad=incidence.to(dtype).reshape(shape),
         )
 
     def _compiled_cast(self, origins_mm, directions, range_mm, arms, own, poses) -> RayHit:
@@ -334,45 +360,77 @@ class BatchedScene:
         """Queries of one environment among bodies at rest, for the compiled engine."""
         return LoneScene(self, lines)
 
-    def clear_lines(
+    def look(
         self,
         eyes_mm: torch.Tensor,
-        ends_mm: torch.Tensor,
-        distance_mm: torch.Tensor,
+        axes: torch.Tensor,
+        points_mm: torch.Tensor,
+        normals: torch.Tensor,
+        picture: tuple[float, float, float, float],
         short_mm: float,
-        wanted: torch.Tensor,
         arms: Mapping[str, torch.Tensor] | None = None,
         own: str | None = None,
         poses: Mapping[str, torch.Tensor] | Placement | None = None,
-    ) -> torch.Tensor:
-        """(B, M) bool: the wanted lines of sight that nothing crosses; with the compiled engine.
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Which points (B, M, 3) cameras at eyes (B, 3) along axes (B, 3) have in the picture
+        (B, M) bool, which of them nothing hides (B, M) bool, and where the points' middle is
+        (B, 2): its angle to the axis, rad, and its distance, mm. World frame, mm.
 
-        From eyes (B, 3) to ends (B, M, 3) mm, world frame, distance_mm (B, M) apart; what a line
-        meets in its last short_mm does not count. Arms, own and poses are those of `cast`.
+        picture: lift of the points, half of the field of view, nearest and farthest distance. What
+        a line of sight meets in its last short_mm does not count. Arms, own and poses are those of
+        `cast`. The engine in tensor operations has rays only (`sights`).
         """
-        clear = wanted.clone()
-        lines = [t.numpy() for t in (eyes_mm.contiguous(), ends_mm, distance_mm)]
-        asked, flags = wanted.numpy(), clear.numpy()
-        chains, bodies = [], []
+        given = [t.detach().contiguous() for t in (eyes_mm, axes, points_mm, normals)]
+        chains = []
         for name, line in (arms or {}).items():
             radius = self.radius_mm(name)
             gap = self_contact_gap_mm(radius) if name == own else -1.0
-            chains.append((_held(line).numpy(), radius, gap))
-        for body, tree in zip(self.bodies, self._trees, strict=True):
-            turn, shift = (t.numpy() for t in self._inward(body, poses))
-            bodies.append((turn, shift, tree.arrays))
+            chains.append((_held(line), radius, gap))
+        frames_of = [self._inward(body, poses) for body in self.bodies]
+        if self.engine == "warp":
+            from surgisoft.scene.warp_queries import WarpLook
 
-        def hide(part: slice) -> None:
-            place = [array[part] for array in lines]
-            for line, radius, gap in chains:
-                chain = (line[part], radius, gap)
-                hide_behind_chain(*place, short_mm, *chain, asked[part], flags[part])
+            sight = WarpLook(*given, picture, short_mm)
+            for chain in chains:
+                sight.hide(*chain)
+            for surface, frame in zip(self._surfaces, frames_of, strict=True):
+                surface.hide(sight, *frame)
+            return sight.wanted, sight.clear, sight.middle.to(eyes_mm.dtype)
+        return self._compiled_look(given, picture, short_mm, chains, frames_of)
+
+    def _compiled_look(self, given, picture, short_mm, chains, frames_of):
+        """`look` in a few compiled loops."""
+        count, each = given[2].shape[:2]
+        ends = np.empty((count, each, 3))
+        distance = np.empty((count, each))
+        wanted, clear = (torch.empty((count, each), dtype=torch.bool) for _ in range(2))
+        middle = torch.empty((count, 2), dtype=given[0].dtype)
+        asked, flags = wanted.numpy(), clear.numpy()
+        cameras = [t.numpy() for t in given]
+        found = [ends, asked, distance, middle.numpy()]
+        lines = [(line.numpy(), radius, gap) for line, radius, gap in chains]
+        bodies = [
+            (turn.numpy(), shift.numpy(), tree.arrays)
+            for (turn, shift), tree in zip(frames_of, self._trees, strict=True)
+        ]
+
+        def see(part: slice) -> None:
+            points_in_picture(*(a[part] for a in cameras), *picture, *(a[part] for a in found))
+            flags[part] = asked[part]
+            place = (cameras[0][part], ends[part], distance[part], short_mm)
+            for line, radius, gap in lines:
+                hide_behind_chain(*place, line[part], radius, gap, asked[part], flags[part])
             for turn, shift, tree in bodies:
                 frame = (_of_rows(turn, part), _of_rows(shift, part))
-                hide_behind_body(*place, short_mm, *frame, tree, flags[part])
+                hide_behind_body(*place, *frame, tree, flags[part])
 
-        over_rows(len(clear), hide)
-        return clear
+        over_rows(count, see)
+        return wanted, clear, middle
+
+    @property
+    def sights(self) -> bool:
+        """Whether the engine has lines of sight (`look`) beside rays."""
+        return self.engine != "torch"
 
     def _inward(self, body: Body, poses) -> tuple[torch.Tensor, torch.Tensor]:
         """World to body: linear maps (B or 1, 3, 3) and shifts (B or 1, 3), float64."""
@@ -430,14 +488,14 @@ def _has_warp() -> bool:
 
 
 def _queries(engine: str) -> tuple:
-    """An engine's surface, and its functions: arms apart, an arm folded, rays to arms."""
+    """An engine's surface, and its functions: arms apart, and an arm folded."""
     if engine == "warp":
         from surgisoft.scene import warp_queries as warp
 
-        chains = (warp.chains_apart_warp, warp.chains_folded_warp, warp.rays_to_chains_warp)
+        chains = (warp.chains_apart_warp, warp.chains_folded_warp)
         return warp.WarpSurface, *chains
     kind = CompiledSurface if engine == "compiled" else TorchSurface
-    return kind, chains_apart_torch, chains_folded_torch, rays_to_chains_torch
+    return kind, chains_apart_torch, chains_folded_torch
 
 
 @dataclass(frozen=True, eq=False)
@@ -548,7 +606,7 @@ class LoneScene:
         """A function that looks from the kept arrays eye_mm and axis (1, 3) at points (1, M, 3).
 
         picture: lift of the points, half of the field of view, nearest and farthest distance, as
-        for `sight.points_in_picture`; short_mm and own as for `BatchedScene.clear_lines`.
+        for `sight.points_in_picture`; short_mm and own as for `BatchedScene.look`.
         """
         count = points_mm.shape[1]
         ends, distance = np.empty((1, count, 3)), np.empty((1, count))
@@ -666,6 +724,7 @@ def strained_clearance(
     A distance beyond the horizon in the body's frame may be less in the world, by the factor
     stretch.
     """
+    lines = lines.double()  # float32 would round the slope
     own_horizon = stretch * (horizon + radius) - radius + SLOPE_MM
     place = (radius, within, own_horizon)
     least = surface.clearance(lines, given, turn, shift, *place)

@@ -16,8 +16,6 @@ import torch
 
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
-from surgisoft.scene.sight import points_in_picture
-from surgisoft.threads import over_rows
 
 LIFT_MM = 0.05
 """Lines of sight end this far above the surface, so that it does not hide its own points (mm)."""
@@ -96,8 +94,8 @@ def seen_from(
 
     As `view`, whose poses also say how the picture is turned, which does not matter here.
     """
-    if isinstance(eye_mm, torch.Tensor) and getattr(caster, "compiled", False):
-        return _compiled_view(caster, camera, eye_mm, axis, points_mm, normals, arms, own, where)
+    if isinstance(eye_mm, torch.Tensor) and getattr(caster, "sights", False):
+        return _view_by_sights(caster, camera, eye_mm, axis, points_mm, normals, arms, own, where)
     lib = torch if isinstance(eye_mm, torch.Tensor) else np
     eye, axis = eye_mm[..., None, :], axis[..., None, :]
     rays = points_mm + LIFT_MM * normals - eye
@@ -121,25 +119,14 @@ def seen_from(
     )
 
 
-def _compiled_view(caster, camera, eye, axis, points, normals, arms, own, where) -> View:
-    """`seen_from` for tensors (B, ...) on the CPU, where `caster` is a compiled `BatchedScene`."""
-    eye, axis, points, normals = (t.detach() for t in (eye, axis, points, normals))
+def _view_by_sights(caster, camera, eye, axis, points, normals, arms, own, where) -> View:
+    """`seen_from` for tensors (B, ...), where `caster` is a `BatchedScene` with lines of sight."""
     count, each = len(eye), points.shape[-2]
     points, normals = points.expand(count, each, 3), normals.expand(count, each, 3)
-    ends = torch.empty((count, each, 3), dtype=torch.float64)
-    distance = torch.empty((count, each), dtype=torch.float64)
-    wanted = torch.empty((count, each), dtype=torch.bool)
-    middle = torch.empty((count, 2), dtype=eye.dtype)
     near, far = camera.range_mm
-    given = [t.contiguous().numpy() for t in (eye, axis, points, normals)]
-    found = [t.numpy() for t in (ends, wanted, distance, middle)]
     picture = (LIFT_MM, 0.5 * camera.fov_rad, float(near), float(far))
-
-    def look(part: slice) -> None:
-        points_in_picture(*(a[part] for a in given), *picture, *(a[part] for a in found))
-
-    over_rows(count, look)
-    clear = caster.clear_lines(eye, ends, distance, SHORT_MM, wanted, arms, own, **where)
+    given = (eye, axis, points, normals, picture, SHORT_MM)
+    wanted, clear, middle = caster.look(*given, arms, own, **where)
     error, reach = middle.unbind(1)
     return View(
         visible=clear,

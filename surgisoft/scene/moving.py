@@ -33,6 +33,11 @@ class Placement:
         """(B, 4, 4) float64: world frame at rest to world frame now, affine, mm."""
         return self.rigid @ self.strains[self.level]
 
+    @property
+    def _inverse(self) -> torch.Tensor:
+        # `inv` would wait for an accelerator, to check that the map has an inverse.
+        return torch.linalg.inv_ex(self.map)[0]
+
     def get(self, body: str) -> torch.Tensor | None:
         """(B, 4, 4) body's frame to the world frame now, affine; None for a body at rest."""
         home = self.at_rest.get(body)
@@ -44,15 +49,15 @@ class Placement:
 
     def at_rest_of(self, points_mm: torch.Tensor) -> torch.Tensor:
         """Points (B, ..., 3) mm, world frame now, in the organ's world frame at rest."""
-        return _applied(torch.linalg.inv(self.map), points_mm)
+        return _applied(self._inverse, points_mm)
 
     def directions_at_rest(self, directions: torch.Tensor) -> torch.Tensor:
         """Unit directions (B, ..., 3), world frame now, as unit directions at rest."""
-        return _turned(torch.linalg.inv(self.map)[:, :3, :3], directions)
+        return _turned(self._inverse[:, :3, :3], directions)
 
     def normals(self, normals: torch.Tensor) -> torch.Tensor:
         """Unit normals (B, ..., 3) of the organ's surface at rest, as they are now."""
-        return _turned(torch.linalg.inv(self.map)[:, :3, :3].mT, normals)
+        return _turned(self._inverse[:, :3, :3].mT, normals)
 
 
 def _applied(pose: torch.Tensor, points: torch.Tensor) -> torch.Tensor:

@@ -420,66 +420,319 @@ def chains_to_surface(
     out[b] = wp.min(estimate - radius, horizon)
 
 
+@wp.func
+def nearest_face(
+    p: vec, d: vec, best: real, faces: Points2, starts: Whole, lower: Points, upper: Points
+):
+    """Distance to and tree index of the first face on a ray before `best`; -1 for none."""
+    inverse = vec(FAR, FAR, FAR)
+    for axis in range(3):
+        inverse[axis] = wp.where(d[axis] == ZERO, wp.float64(1e300), ONE / d[axis])
+    nearest = real(best)
+    found = int(-1)
+    leaves = starts.shape[0] - 1
+    nodes = Stack()
+    entry = Reach()
+    size = int(1)
+    entry[0] = box_entry(p, inverse, lower[0], upper[0])
+    while size > 0:
+        size = size - 1
+        node = nodes[size]
+        if entry[size] <= nearest:
+            if node >= leaves - 1:
+                leaf = node - (leaves - 1)
+                for k in range(int(starts[leaf]), int(starts[leaf + 1])):
+                    t = line_triangle(p, d, faces[k, 0], faces[k, 1], faces[k, 2])
+                    if t >= ZERO and t < nearest:
+                        nearest = t
+                        found = k
+            else:
+                one = 2 * node + 1
+                two = 2 * node + 2
+                to_one = box_entry(p, inverse, lower[one], upper[one])
+                to_two = box_entry(p, inverse, lower[two], upper[two])
+                if to_one < to_two:
+                    nodes[size] = two
+                    entry[size] = to_two
+                    nodes[size + 1] = one
+                    entry[size + 1] = to_one
+                else:
+                    nodes[size] = one
+                    entry[size] = to_one
+                    nodes[size + 1] = two
+                    entry[size + 1] = to_two
+                size = size + 2
+    return nearest, found
+
+
+@wp.func
+def meets(
+    p: vec, d: vec, limit: real, faces: Points2, starts: Whole, lower: Points, upper: Points
+) -> bool:
+    """Whether the ray from p along the unit vector d meets a face nearer than `limit`."""
+    inverse = vec(FAR, FAR, FAR)
+    for axis in range(3):
+        inverse[axis] = wp.where(d[axis] == ZERO, wp.float64(1e300), ONE / d[axis])
+    leaves = starts.shape[0] - 1
+    nodes = Stack()
+    size = int(1)
+    met = bool(False)
+    while size > 0 and not met:
+        size = size - 1
+        node = nodes[size]
+        # Box entries are rounded down, so that none that the ray grazes is lost.
+        if box_entry(p, inverse, lower[node], upper[node]) <= limit:
+            if node >= leaves - 1:
+                leaf = node - (leaves - 1)
+                for k in range(int(starts[leaf]), int(starts[leaf + 1])):
+                    t = line_triangle(p, d, faces[k, 0], faces[k, 1], faces[k, 2])
+                    if t >= ZERO and t < limit:
+                        met = True
+            else:
+                nodes[size] = 2 * node + 1
+                nodes[size + 1] = 2 * node + 2
+                size = size + 2
+    return met
+
+
 @wp.kernel
-def rays_to_surface(
-    origins: Points,
+def aim_rays(
     directions: Points,
     range_mm: real,
+    aims: Points,
+    struck: wp.array(dtype=wp.int8),
+    body: wp.array(dtype=wp.int32),
+    face: wp.array(dtype=wp.int32),
+    t: Numbers,
+    normals: Points,
+):
+    """Unit direction of ray `tid`, which meets nothing yet."""
+    n = wp.tid()
+    d = directions[n]
+    length = wp.length(d)
+    aim = d / wp.where(length > ZERO, length, ONE)
+    aims[n] = aim
+    normals[n] = -aim
+    struck[n] = wp.int8(0)
+    body[n] = -1
+    face[n] = -1
+    t[n] = range_mm
+
+
+@wp.kernel
+def rays_to_body(
+    origins: Points,
+    aims: Points,
+    each: int,
+    turns: wp.array(dtype=wp.mat33d),
+    shifts: Points,
     faces: Points2,
     starts: Whole,
     order: Whole,
     lower: Points,
     upper: Points,
-    distance: Numbers,
-    face: Whole,
+    outward: Points,
+    which: int,
+    kind: int,
+    struck: wp.array(dtype=wp.int8),
+    body: wp.array(dtype=wp.int32),
+    face: wp.array(dtype=wp.int32),
+    t: Numbers,
+    normals: Points,
 ):
-    """Distance and face of ray `tid`, in the body's frame; range_mm and -1 for a miss."""
+    """First hit of ray `tid` on a body, where it is nearer than t; see `rays.rays_to_body`."""
     n = wp.tid()
-    p = origins[n]
-    d = directions[n]
-    best = real(range_mm)
+    pose = wp.where(turns.shape[0] > 1, n / each, 0)
+    turn = turns[pose]
+    p = turn * origins[n] + shifts[pose]
+    d = turn * aims[n]
+    if wp.isfinite(wp.dot(p + d, vec(ONE, ONE, ONE))):
+        distance, found = nearest_face(p, d, t[n], faces, starts, lower, upper)
+        if found >= 0:
+            t[n] = distance
+            own = int(order[found])
+            face[n] = own
+            body[n] = which
+            struck[n] = wp.int8(kind)
+            normal = wp.transpose(turn) * outward[own]
+            size = wp.length_sq(normal)
+            if wp.abs(size - ONE) > wp.float64(1e-9):  # a strained body
+                normal = normal / wp.sqrt(size)
+            normals[n] = normal
+
+
+@wp.kernel
+def rays_to_arm(
+    origins: Points,
+    aims: Points,
+    each: int,
+    lines: Points2,
+    radius: real,
+    gap: real,
+    kind: int,
+    struck: wp.array(dtype=wp.int8),
+    body: wp.array(dtype=wp.int32),
+    face: wp.array(dtype=wp.int32),
+    t: Numbers,
+    normals: Points,
+):
+    """First hit of ray `tid` on an arm, where it is nearer than t; see `rays.rays_to_chains`."""
+    n = wp.tid()
+    b = n / each
+    o = origins[n]
+    d = aims[n]
+    best = t[n]
     found = int(-1)
-    sum_of_all = wp.dot(p, vec(ONE, ONE, ONE)) + wp.dot(d, vec(ONE, ONE, ONE))
-    if wp.isfinite(sum_of_all):
-        inverse = vec(FAR, FAR, FAR)
-        for axis in range(3):
-            inverse[axis] = wp.where(d[axis] == ZERO, wp.float64(1e300), ONE / d[axis])
-        leaves = starts.shape[0] - 1
-        nodes = Stack()
-        entry = Reach()
-        size = int(1)
-        entry[0] = box_entry(p, inverse, lower[0], upper[0])
-        while size > 0:
-            size = size - 1
-            node = nodes[size]
-            if entry[size] <= best:
-                if node >= leaves - 1:
-                    leaf = node - (leaves - 1)
-                    for k in range(int(starts[leaf]), int(starts[leaf + 1])):
-                        t = line_triangle(p, d, faces[k, 0], faces[k, 1], faces[k, 2])
-                        if t >= ZERO and t < best:
-                            best = t
-                            found = k
-                else:
-                    one = 2 * node + 1
-                    two = 2 * node + 2
-                    to_one = box_entry(p, inverse, lower[one], upper[one])
-                    to_two = box_entry(p, inverse, lower[two], upper[two])
-                    if to_one < to_two:
-                        nodes[size] = two
-                        entry[size] = to_two
-                        nodes[size + 1] = one
-                        entry[size + 1] = to_one
-                    else:
-                        nodes[size] = one
-                        entry[size] = to_one
-                        nodes[size + 1] = two
-                        entry[size + 1] = to_two
-                    size = size + 2
-    distance[n] = best
-    face[n] = wp.int64(-1)
+    arc = real(0.0)
+    for turn in range(lines.shape[1] - 1):
+        k = lines.shape[1] - 2 - turn
+        p = lines[b, k]
+        q = lines[b, k + 1]
+        length = wp.length(q - p)
+        if arc >= gap:
+            away = HALF * (p + q) - o
+            away = away - wp.max(ZERO, wp.dot(away, d)) * d
+            reach = radius + HALF * length + wp.float64(1e-9)
+            if wp.length_sq(away) <= reach * reach:
+                hit = capsule_entry(o, d, p, q, radius)
+                if hit < best or (found >= 0 and hit == best):  # the one nearest to the base
+                    best = hit
+                    found = k
+        arc = arc + length
     if found >= 0:
-        face[n] = order[found]
+        t[n] = best
+        body[n] = -1
+        face[n] = -1
+        struck[n] = wp.int8(kind)
+        a = lines[b, found]
+        u = lines[b, found + 1] - a
+        x = o + best * d - a
+        share = wp.clamp(wp.dot(x, u) / (wp.dot(u, u) + wp.float64(1e-30)), ZERO, ONE)
+        x = x - share * u
+        length = wp.length(x)
+        normals[n] = x / wp.where(length > ZERO, length, ONE)
+
+
+@wp.kernel
+def ray_ends(
+    origins: Points, aims: Points, t: Numbers, normals: Points, point: Points, incidence: Numbers
+):
+    """End of ray `tid` and its angle of incidence, rad."""
+    n = wp.tid()
+    a = aims[n]
+    point[n] = origins[n] + t[n] * a
+    sine = wp.length(wp.cross(normals[n], a))
+    incidence[n] = wp.atan2(sine, wp.abs(wp.dot(normals[n], a)))
+
+
+# Lines of sight.
+
+
+@wp.func
+def angle_between(a: vec, b: vec) -> real:
+    """Angle of two vectors, rad (Kahan 2006: atan2 form)."""
+    return wp.atan2(wp.length(wp.cross(a, b)), wp.dot(a, b))
+
+
+@wp.kernel
+def points_in_picture(
+    eyes: Points,
+    axes: Points,
+    points: Points2,
+    normals: Points2,
+    lift: real,
+    half_fov: real,
+    near: real,
+    far: real,
+    ends: Points2,
+    wanted: wp.array2d(dtype=wp.bool),
+    clear: wp.array2d(dtype=wp.bool),
+    distance: Numbers2,
+):
+    """Whether camera b has point m in its picture and in focus; see `sight.points_in_picture`."""
+    b, m = wp.tid()
+    end = points[b, m] + lift * normals[b, m]
+    ray = end - eyes[b]
+    length = wp.length(ray)
+    seen = length >= near and length <= far and angle_between(axes[b], ray) <= half_fov
+    ends[b, m] = end
+    distance[b, m] = length
+    wanted[b, m] = seen
+    clear[b, m] = seen
+
+
+@wp.kernel
+def middles(eyes: Points, axes: Points, points: Points2, middle: Numbers2):
+    """Angle to the axis, rad, and distance, mm, of the middle of the points of camera `tid`."""
+    b = wp.tid()
+    total = vec(ZERO, ZERO, ZERO)
+    for m in range(points.shape[1]):
+        total = total + points[b, m]
+    ray = total / wp.float64(points.shape[1]) - eyes[b]
+    middle[b, 0] = angle_between(axes[b], ray)
+    middle[b, 1] = wp.length(ray)
+
+
+@wp.kernel
+def hide_behind_arm(
+    eyes: Points,
+    ends: Points2,
+    distance: Numbers2,
+    short_mm: real,
+    lines: Points2,
+    radius: real,
+    gap: real,
+    clear: wp.array2d(dtype=wp.bool),
+):
+    """Clear the flag of line of sight m of camera b where it meets an arm before its last `short_mm`
+    mm; see `sight.hide_behind_chain`."""
+    b, m = wp.tid()
+    if not clear[b, m]:
+        return
+    o = eyes[b]
+    d = (ends[b, m] - o) / distance[b, m]
+    limit = distance[b, m] - short_mm
+    arc = real(0.0)
+    for turn in range(lines.shape[1] - 1):
+        k = lines.shape[1] - 2 - turn
+        p = lines[b, k]
+        q = lines[b, k + 1]
+        length = wp.length(q - p)
+        if arc >= gap:
+            away = HALF * (p + q) - o
+            away = away - wp.max(ZERO, wp.dot(away, d)) * d
+            reach = radius + HALF * length + wp.float64(1e-9)
+            if wp.length_sq(away) <= reach * reach:
+                if capsule_entry(o, d, p, q, radius) < limit:
+                    clear[b, m] = False
+                    return
+        arc = arc + length
+
+
+@wp.kernel
+def hide_behind_body(
+    eyes: Points,
+    ends: Points2,
+    distance: Numbers2,
+    short_mm: real,
+    turns: wp.array(dtype=wp.mat33d),
+    shifts: Points,
+    faces: Points2,
+    starts: Whole,
+    lower: Points,
+    upper: Points,
+    clear: wp.array2d(dtype=wp.bool),
+):
+    """Clear the flag of line of sight m of camera b where it meets a body before its last `short_mm`
+    mm."""
+    b, m = wp.tid()
+    if not clear[b, m]:
+        return
+    pose = wp.where(turns.shape[0] > 1, b, 0)
+    p = turns[pose] * eyes[b] + shifts[pose]
+    d = turns[pose] * ((ends[b, m] - eyes[b]) / distance[b, m])
+    if meets(p, d, distance[b, m] - short_mm, faces, starts, lower, upper):
+        clear[b, m] = False
 
 
 @wp.kernel
@@ -535,43 +788,6 @@ def chains_folded(lines: Points2, radius: real, gap: real, horizon: real, out: N
                     best = wp.min(best, wp.sqrt(segments_d2(p, q, c, d)))
             between = between + length
     out[b] = best - TWO * radius
-
-
-@wp.kernel
-def rays_to_chains(
-    origins: Points2,
-    directions: Points2,
-    lines: Points2,
-    radius: real,
-    gap: real,
-    distance: Numbers2,
-    segment: Whole2,
-):
-    """First hit of ray r on the arm of environment b, where it is nearer than `distance`."""
-    b, r = wp.tid()
-    o = origins[b, r]
-    d = directions[b, r]
-    best = distance[b, r]
-    found = int(-1)
-    arc = real(0.0)
-    for turn in range(lines.shape[1] - 1):
-        k = lines.shape[1] - 2 - turn
-        p = lines[b, k]
-        q = lines[b, k + 1]
-        length = wp.length(q - p)
-        if arc >= gap:
-            away = HALF * (p + q) - o
-            away = away - wp.max(ZERO, wp.dot(away, d)) * d
-            reach = radius + HALF * length + wp.float64(1e-9)
-            if wp.length_sq(away) <= reach * reach:
-                t = capsule_entry(o, d, p, q, radius)
-                if t < best or (found >= 0 and t == best):  # of several the one nearest to the base
-                    best = t
-                    found = k
-        arc = arc + length
-    if found >= 0:
-        distance[b, r] = best
-        segment[b, r] = wp.int64(found)
 
 
 @wp.kernel

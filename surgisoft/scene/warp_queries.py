@@ -61,19 +61,23 @@ class WarpSurface:
         grid = (field.cell_mm, field.band_mm, field.slack_mm)
         self._field = (wp.from_torch(values), wp.vec3d(*map(float, field.origin_mm)), *grid)
 
-    def first_hit(
-        self, origins: torch.Tensor, directions: torch.Tensor, range_mm: float
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Distance (N,) mm and face (N,) of rays (N, 3) in the body's frame; -1 for none."""
-        o, d = held(origins), held(directions)
-        distance = torch.empty_like(o[:, 0])
-        face = torch.empty(len(o), dtype=torch.int64, device=o.device)
+    def cast(self, rays: WarpRays, turn: torch.Tensor, shift: torch.Tensor, which: int, kind: int):
+        """First hits of rays on the surface, where they are nearer than what was met before.
+
+        turn (B or 1, 3, 3) and shift (B or 1, 3): world to body; which: number of the body; kind:
+        its `Struck`.
+        """
         faces, starts, lower, upper = self._tree
-        tree = (faces, starts, self._order, lower, upper)
-        found = (wp.from_torch(distance), wp.from_torch(face))
-        given = [vectors(o), vectors(d), float(range_mm), *tree, *found]
-        launch(kernels.rays_to_surface, len(o), given, o)
-        return distance, face
+        frame = (wp.from_torch(held(turn), dtype=wp.mat33d), vectors(held(shift)))
+        mesh = (faces, starts, self._order, lower, upper, vectors(self.normals))
+        given = [*rays.given, *frame, *mesh, which, kind, *rays.found]
+        launch(kernels.rays_to_body, rays.count, given, rays.origins)
+
+    def hide(self, look: WarpLook, turn: torch.Tensor, shift: torch.Tensor) -> None:
+        """Clear the flags of lines of sight that meet the surface; frames as for `cast`."""
+        frame = (wp.from_torch(held(turn), dtype=wp.mat33d), vectors(held(shift)))
+        given = [*look.given, *frame, *self._tree, look.flags]
+        launch(kernels.hide_behind_body, look.shape, given, look.ends)
 
     def clearance(
         self,
@@ -131,18 +135,80 @@ def chains_folded_warp(
     return out.to(lines.dtype)
 
 
-def rays_to_chains_warp(
-    origins: torch.Tensor,
-    directions: torch.Tensor,
-    lines: torch.Tensor,
-    radius: float,
-    gap: float,
-    best: torch.Tensor,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """First hits of rays (B, R, 3) on arms (B, K, 3) below `best` (B, R): distance, segment."""
-    o, d, line = held(origins), held(directions), held(lines)
-    distance, segment = best.clone(), torch.zeros_like(best, dtype=torch.int64)
-    rays = [vectors(o), vectors(d), vectors(line), float(radius), float(gap)]
-    found = [wp.from_torch(distance), wp.from_torch(segment)]
-    launch(kernels.rays_to_chains, tuple(best.shape), rays + found, o)
-    return distance, segment
+class WarpRays:
+    """Rays that are followed to what they meet first: bodies (`WarpSurface.cast`), then arms."""
+
+    def __init__(self, origins: torch.Tensor, directions: torch.Tensor, range_mm: float, each: int):
+        """origins and directions (N, 3), world frame, mm; `each` rays for each environment."""
+        self.origins, aims = held(origins), held(directions)
+        self.count, place = len(origins), self.origins.device
+        self._aims, self.normals = torch.empty_like(aims), torch.empty_like(aims)
+        self.struck = torch.empty(self.count, dtype=torch.int8, device=place)
+        """(N,) what is met, a `Struck`."""
+        self.body, self.face = (
+            torch.empty(self.count, dtype=torch.int32, device=place) for _ in range(2)
+        )
+        """(N,) body and face that are met, -1 for none."""
+        self.distance_mm = torch.empty_like(aims[:, 0])
+        """(N,) distance of it."""
+        marks = [wp.from_torch(t) for t in (self.struck, self.body, self.face, self.distance_mm)]
+        self.found = [*marks, vectors(self.normals)]
+        self.given = [vectors(self.origins), vectors(self._aims), each]
+        given = [vectors(aims), float(range_mm), vectors(self._aims), *self.found]
+        launch(kernels.aim_rays, self.count, given, aims)
+
+    def meet(self, lines: torch.Tensor, radius: float, gap: float, kind: int) -> None:
+        """Follow them to an arm (B, K, 3), whose last `gap` mm of arc are left out."""
+        given = [*self.given, vectors(held(lines)), float(radius), float(gap), kind, *self.found]
+        launch(kernels.rays_to_arm, self.count, given, self.origins)
+
+    def ends(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Where they end, (N, 3) mm, and their angles of incidence (N,) rad."""
+        point, incidence = torch.empty_like(self.normals), torch.empty_like(self.distance_mm)
+        origins, aims, _ = self.given
+        *_, t, normals = self.found
+        given = [origins, aims, t, normals, vectors(point), wp.from_torch(incidence)]
+        launch(kernels.ray_ends, self.count, given, point)
+        return point, incidence
+
+
+class WarpLook:
+    """Lines of sight of B cameras to M points each, of which bodies and arms hide some."""
+
+    def __init__(
+        self,
+        eyes: torch.Tensor,
+        axes: torch.Tensor,
+        points: torch.Tensor,
+        normals: torch.Tensor,
+        picture: tuple[float, float, float, float],
+        short_mm: float,
+    ):
+        """eyes and axes (B, 3), points and normals (B, M, 3), world frame, mm.
+
+        picture: lift of the points, half of the field of view, nearest and farthest distance;
+        short_mm: what a line meets so near to its end does not hide the point.
+        """
+        eye, axis, at, outward = (held(t) for t in (eyes, axes, points, normals))
+        self.shape, self.ends = tuple(at.shape[:2]), torch.empty_like(at)
+        distance = torch.empty_like(at[..., 0])
+        self.wanted = torch.empty(self.shape, dtype=torch.bool, device=at.device)
+        """(B, M): inside the cone and in range."""
+        self.clear = torch.empty_like(self.wanted)
+        """(B, M): and nothing in between."""
+        self.middle = torch.empty((len(at), 2), dtype=at.dtype, device=at.device)
+        """(B, 2): angle of the points' middle to the axis, rad, and its distance, mm."""
+        self.flags, far = wp.from_torch(self.clear), wp.from_torch(distance)
+        self.given = [vectors(eye), vectors(self.ends), far, float(short_mm)]
+        place = [vectors(eye), vectors(axis), vectors(at)]
+        found = [vectors(self.ends), wp.from_torch(self.wanted), self.flags, far]
+        limits = [float(number) for number in picture]
+        given = [*place, vectors(outward), *limits, *found]
+        launch(kernels.points_in_picture, self.shape, given, at)
+        launch(kernels.middles, len(at), [*place, wp.from_torch(self.middle)], at)
+        self._kept = (eye, distance)  # Warp's arrays do not own their memory
+
+    def hide(self, lines: torch.Tensor, radius: float, gap: float) -> None:
+        """Clear the flags of lines that meet an arm (B, K, 3), but for its last `gap` mm of arc."""
+        given = [*self.given, vectors(held(lines)), float(radius), float(gap), self.flags]
+        launch(kernels.hide_behind_arm, self.shape, given, self.ends)

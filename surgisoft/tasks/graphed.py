@@ -43,7 +43,8 @@ class GraphedEpisodes:
     def __init__(self, task: Task, count: int, record: Callable[..., Any] = cuda_graph):
         """record: what makes graphs; in place of `cuda_graph` where there is no GPU."""
         self.task, self.count = task, count
-        self._plain, self._record = Episodes(task, donate=True), record
+        self.plain, self._record = Episodes(task, donate=True), record
+        """The same, one operation after the other."""
         self._state: TaskState | None = None
         self._work: dict[tuple, Callable[[], Any]] = {}
         device = task.world.device
@@ -56,7 +57,7 @@ class GraphedEpisodes:
     @torch.inference_mode()
     def start(self, stream: Stream) -> TaskState:
         """Start an episode for each of the `count` random number streams."""
-        return self._held(self._plain.start(stream))
+        return self.held(self.plain.start(stream))
 
     def seeded(self, seed: int, count: int, first: int = 0) -> TaskState:
         """Start episodes number `first` to `first + count - 1` of a seed."""
@@ -65,7 +66,7 @@ class GraphedEpisodes:
     @torch.inference_mode()
     def step(self, state: TaskState, actions: Mapping[str, Tensor]) -> tuple[TaskState, Outcome]:
         """Advance every episode one step; none is reset."""
-        held = self._held(state)
+        held = self.held(state)
         for agent, action in actions.items():
             self._actions[agent].copy_(action)
         return held, self._done(("step",), self._stepped).copied()
@@ -73,8 +74,8 @@ class GraphedEpisodes:
     @torch.inference_mode()
     def reset(self, state: TaskState, mask: Tensor) -> TaskState:
         """Start new episodes where mask (B,) is set, each with its random number stream."""
-        held = self._held(state)
-        for part, places in self._parts(mask.nonzero()[:, 0]):
+        held = self.held(state)
+        for _, places in self._parts(mask.nonzero()[:, 0]):
             self._done(("reset", len(places)), partial(self._restarted, places))
         return held
 
@@ -84,7 +85,7 @@ class GraphedEpisodes:
     ) -> dict[str, Tensor]:
         """Observations as `observe` gives them, where only episodes index (R,) int64 are not those
         in which `seen` was observed."""
-        held, found = self._held(state), dict(seen)
+        held, found = self.held(state), dict(seen)
         for part, places in self._parts(index):
             name = ("observe", len(places))
             fresh = self._done(name, partial(self._observed, held, places))
@@ -112,44 +113,46 @@ class GraphedEpisodes:
     @torch.inference_mode()
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         """Clipped observations, agent -> (B, D), see `Episodes.observe`."""
-        held = self._held(state)
-        seen = self._done(("observe",), partial(self._plain.observe, held))
+        held = self.held(state)
+        seen = self._done(("observe",), partial(self.plain.observe, held))
         return {agent: value.clone() for agent, value in seen.items()}
 
-    def _stepped(self) -> Any:
-        state, outcome = self._plain.step(self._now, self._actions)
-        packed = Packed.of(outcome)
-        _overwrite(self._now, state)
+    def advanced(self, actions: Mapping[str, Tensor]) -> Packed[Outcome]:
+        """The operations of a step, for a graph that holds more than them."""
+        state, outcome = self.plain.step(self._now, actions)
+        packed = Packed.of(outcome)  # its tensors may be those that are written over
+        overwrite(self._now, state)
         return packed
 
+    def kept(self) -> Callable[[], None]:
+        """A function that brings the present state back."""
+        before = tree_map(torch.clone, self._now)
+        return lambda: overwrite(self._now, before)
+
+    def _stepped(self) -> Any:
+        return self.advanced(self._actions)
+
     def _restarted(self, index: Tensor) -> None:
-        fresh = self._plain.start(rows(self._now.world.stream, index))
+        fresh = self.plain.start(rows(self._now.world.stream, index))
         for old, new in zip(leaves(self._now), leaves(fresh), strict=True):
             old.index_copy_(0, index, new)
 
     def _observed(self, state: TaskState, index: Tensor) -> dict[str, Tensor]:
-        return self._plain.observe(rows(state, index))
+        return self.plain.observe(rows(state, index))
 
     def _done(self, name: tuple, work: Callable[[], Any]) -> Any:
         """The results of a recorded function, which is recorded at its first call."""
         if name not in self._work:
-            before = tree_map(torch.clone, self._now)
-            what = f"{name[0]} of {self.task.name}"
-            self._work[name] = recorded(
-                work,
-                lambda: _overwrite(self._now, before),
-                self.task.world.device,
-                self._record,
-                what,
-            )
+            what, device = f"{name[0]} of {self.task.name}", self.task.world.device
+            self._work[name] = recorded(work, self.kept(), device, self._record, what)
         return self._work[name]()
 
-    def _held(self, state: TaskState) -> TaskState:
+    def held(self, state: TaskState) -> TaskState:
         """The state in the tensors in which graphs find it."""
         if self._state is None:
             self._state = tree_map(torch.clone, state)
         elif state is not self._state:
-            _overwrite(self._state, state)
+            overwrite(self._state, state)
         return self._state
 
     @property
@@ -177,7 +180,11 @@ class Packed(Generic[Tree]):
 
     def copied(self) -> Tree:
         """A copy of the pytree."""
-        rows = {kind: iter(part.clone().unbind(0)) for kind, part in self.parts.items()}
+        return Packed(self.tree, {kind: part.clone() for kind, part in self.parts.items()}).views()
+
+    def views(self) -> Tree:
+        """The pytree with views of the large tensors."""
+        rows = {kind: iter(part.unbind(0)) for kind, part in self.parts.items()}
         return tree_map(lambda value: next(rows[_kind(value)]), self.tree)
 
 
@@ -185,7 +192,7 @@ def _kind(value: Tensor) -> tuple:
     return value.dtype, tuple(value.shape)
 
 
-def _overwrite(held: Any, new: Any) -> None:
+def overwrite(held: Any, new: Any) -> None:
     """Copy the tensors of a pytree into those of another one of the same structure.
 
     Some of the new ones may be held ones, in the same place or in another.
@@ -202,4 +209,3 @@ def _overwrite(held: Any, new: Any) -> None:
     ]
     for (old, _), value in zip(pairs, values, strict=True):
         old.copy_(value)
-

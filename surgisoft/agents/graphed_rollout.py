@@ -108,13 +108,11 @@ class GraphedRollout:
     def _done(self, name: str, work: Callable[[], Any]) -> Any:
         """The results of a recorded function, which is recorded at its first call."""
         if name not in self._work:
-            before = [value.clone() for value in self._seen.values()]
-            restore_state = self._episodes.kept()
+            before, restore_state = self._seen.clone(), self._episodes.kept()
 
             def restore() -> None:
                 restore_state()
-                for value, old in zip(self._seen.values(), before, strict=True):
-                    value.copy_(old)
+                overwrite(self._seen.to_dict(), before.to_dict())
 
             what, device = f"a rollout's {name}", self.env.task.world.device
             self._work[name] = recorded(work, restore, device, self._record, what)

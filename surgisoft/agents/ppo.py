@@ -163,8 +163,8 @@ class RolloutMeans:
 
     @classmethod
     def of(cls, means: dict[str, float], rows: int) -> RolloutMeans:
-        """From means by the names `reward/AGENT`, `term/AGENT/TERM`, `measure/NAME` and `done`, over
-        so many rows."""
+        """From means over so many rows by the names `reward/AGENT`, `term/AGENT/TERM`,
+        `measure/NAME` and `done`."""
 
         def part(prefix: str) -> dict[str, float]:
             return {n.removeprefix(prefix): v for n, v in means.items() if n.startswith(prefix)}

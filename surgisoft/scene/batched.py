@@ -238,8 +238,8 @@ class BatchedScene:
         from surgisoft.scene.warp_queries import WarpRays
 
         shape, dtype = origins_mm.shape[:-1], origins_mm.dtype
-        flat = (t.detach().reshape(-1, 3) for t in (origins_mm, directions))
-        rays = WarpRays(*flat, range_mm, math.prod(shape[1:]))
+        origins, aims = (t.detach().reshape(-1, 3) for t in (origins_mm, directions))
+        rays = WarpRays(origins, aims, range_mm, math.prod(shape[1:]))
         for n, (body, surface) in enumerate(zip(self.bodies, self._surfaces, strict=True)):
             surface.cast(rays, *self._inward(body, poses), n, int(struck_of(body)))
         for name, line in arms.items():
@@ -380,7 +380,9 @@ class BatchedScene:
         a line of sight meets in its last short_mm does not count. Arms, own and poses are those of
         `cast`. The engine in tensor operations has rays only (`sights`).
         """
-        given = [t.detach().contiguous() for t in (eyes_mm, axes, points_mm, normals)]
+        eyes, ahead, points, outward = (
+            t.detach().contiguous() for t in (eyes_mm, axes, points_mm, normals)
+        )
         chains = []
         for name, line in (arms or {}).items():
             radius = self.radius_mm(name)
@@ -390,23 +392,24 @@ class BatchedScene:
         if self.engine == "warp":
             from surgisoft.scene.warp_queries import WarpLook
 
-            sight = WarpLook(*given, picture, short_mm)
+            sight = WarpLook(eyes, ahead, points, outward, picture, short_mm)
             for chain in chains:
                 sight.hide(*chain)
             for surface, frame in zip(self._surfaces, frames_of, strict=True):
                 surface.hide(sight, *frame)
             return sight.wanted, sight.clear, sight.middle.to(eyes_mm.dtype)
-        return self._compiled_look(given, picture, short_mm, chains, frames_of)
+        cameras = (eyes, ahead, points, outward)
+        return self._compiled_look(cameras, picture, short_mm, chains, frames_of)
 
-    def _compiled_look(self, given, picture, short_mm, chains, frames_of):
+    def _compiled_look(self, cameras, picture, short_mm, chains, frames_of):
         """`look` in a few compiled loops."""
-        count, each = given[2].shape[:2]
+        count, each = cameras[2].shape[:2]
         ends = np.empty((count, each, 3))
         distance = np.empty((count, each))
         wanted, clear = (torch.empty((count, each), dtype=torch.bool) for _ in range(2))
-        middle = torch.empty((count, 2), dtype=given[0].dtype)
+        middle = torch.empty((count, 2), dtype=cameras[0].dtype)
         asked, flags = wanted.numpy(), clear.numpy()
-        cameras = [t.numpy() for t in given]
+        given = [t.numpy() for t in cameras]
         found = [ends, asked, distance, middle.numpy()]
         lines = [(line.numpy(), radius, gap) for line, radius, gap in chains]
         bodies = [
@@ -415,9 +418,9 @@ class BatchedScene:
         ]
 
         def see(part: slice) -> None:
-            points_in_picture(*(a[part] for a in cameras), *picture, *(a[part] for a in found))
+            points_in_picture(*(a[part] for a in given), *picture, *(a[part] for a in found))
             flags[part] = asked[part]
-            place = (cameras[0][part], ends[part], distance[part], short_mm)
+            place = (given[0][part], ends[part], distance[part], short_mm)
             for line, radius, gap in lines:
                 hide_behind_chain(*place, line[part], radius, gap, asked[part], flags[part])
             for turn, shift, tree in bodies:

@@ -684,8 +684,8 @@ def hide_behind_arm(
     gap: real,
     clear: wp.array2d(dtype=wp.bool),
 ):
-    """Clear the flag of line of sight m of camera b where it meets an arm before its last `short_mm`
-    mm; see `sight.hide_behind_chain`."""
+    """Clear the flag of line of sight m of camera b where it meets an arm before its last
+    `short_mm`; see `sight.hide_behind_chain`."""
     b, m = wp.tid()
     if not clear[b, m]:
         return
@@ -723,8 +723,8 @@ def hide_behind_body(
     upper: Points,
     clear: wp.array2d(dtype=wp.bool),
 ):
-    """Clear the flag of line of sight m of camera b where it meets a body before its last `short_mm`
-    mm."""
+    """Clear the flag of line of sight m of camera b where it meets a body before its last
+    `short_mm`; see `sight.hide_behind_body`."""
     b, m = wp.tid()
     if not clear[b, m]:
         return

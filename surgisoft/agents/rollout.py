@@ -164,7 +164,7 @@ def _rolled_out(
     steps = torch.zeros(count, dtype=torch.int64, device=device)
     terminated, failed = torch.zeros_like(live), torch.zeros_like(live)
     returns = {agent: torch.zeros(count, device=device) for agent in task.agents}
-    traces: dict[str, list[Tensor]] = {}
+    traces: list[Tensor] = []
     if watch:
         watch(Instant(first + at, state, None, None, live))
     for step in range(task.steps):
@@ -172,10 +172,10 @@ def _rolled_out(
         state, outcome = runner.step(state, actions)
         if watch:
             watch(Instant(first + at, state, actions, outcome, live))
-        for name, value in outcome.measures.items():
-            row = torch.full((count,), torch.nan, device=device)
-            row[at] = value.float().masked_fill(~live, torch.nan)
-            traces.setdefault(name, []).append(row)
+        if outcome.measures:
+            values = torch.stack([value.float() for value in outcome.measures.values()])
+            row = torch.full((len(values), count), torch.nan, device=device)
+            traces.append(row.index_copy_(1, at, values.masked_fill_(~live, torch.nan)))
         for agent, value in outcome.rewards.items():
             returns[agent].index_add_(0, at, value.masked_fill(~live, 0.0))
         steps.index_add_(0, at, live.long())
@@ -189,7 +189,9 @@ def _rolled_out(
         if isinstance(runner, Episodes) and 2 * len(remaining) <= len(live):
             state, at, live = rows(state, remaining), at[remaining], live[remaining]
     report(task.steps)
-    measures = {name: _padded(torch.stack(trace), task.steps) for name, trace in traces.items()}
+    whole = torch.stack(traces, 1).unbind(0) if traces else ()  # (T, N) of each measure
+    names = outcome.measures
+    measures = {n: _padded(one, task.steps) for n, one in zip(names, whole, strict=True)}
     dt_s = task.world.config.dt_s
     return Rollout(task.name, dt_s, steps, returns, terminated, failed, measures)
 

@@ -27,8 +27,15 @@ def cuda_graph(work: Callable[[], Found]) -> Callable[[], Found]:
     `work` is called once, but nothing is computed then; it may not read a value of a tensor.
     """
     graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        found = work()
+    random = torch.cuda.default_generators[torch.cuda.current_device()]
+    before = random.clone_state()
+    try:
+        with torch.cuda.graph(graph):
+            found = work()
+    except BaseException:
+        # The generator takes a capture that failed for one that goes on, and would draw no more.
+        random.graphsafe_set_state(before)
+        raise
 
     def again() -> Found:
         graph.replay()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import torch
 from rsl_rl.models import MLPModel
 from rsl_rl.modules.distribution import GaussianDistribution
 from torch import Tensor, nn
@@ -70,6 +71,14 @@ class ActionNoise(GaussianDistribution):
     def deviation(self) -> Tensor:
         """(m,) standard deviations of the present parameters."""
         return self.log_std_param.clamp(*self.log_std_range).exp()
+
+    def sample(self) -> Tensor:
+        """(B, m) outputs, drawn."""
+        mean = self.mean
+        if mean.device.type == "cpu":
+            return super().sample()
+        # PyTorch's `normal` waits for an accelerator, to check that no deviation is negative.
+        return torch.addcmul(mean, self.deviation(), torch.randn_like(mean))
 
     def log_prob(self, outputs: Tensor) -> Tensor:
         """(B,) log-likelihood of outputs (B, m)."""

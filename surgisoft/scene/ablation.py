@@ -367,10 +367,8 @@ class AblationMap:
     def report(self, state: AblationState) -> RingReport:
         """Progress of the cut in each environment."""
         length = self._ring_mm[state.ring] / self.patch.stations
-        compiled = self.device.type == "cpu"
-        cut, gap, burnt = (cut_compiled if compiled else cut_torch)(
-            state.peak, state.band_mm2, self.cut_dose
-        )
+        engine = default_engine(self.device)
+        cut, gap, burnt = _cuts_of(engine)(state.peak, state.band_mm2, self.cut_dose)
         cut_length = cut * length
         delivered = state.delivered_j.reshape(len(cut), -1).sum(1)
         beyond = (delivered - state.zone_j.sum(1)).clamp(min=0.0)
@@ -542,6 +540,15 @@ def sweep_fluence(
     still = torch.exp(-((scale * (along - 0.5 * length[:, None])) ** 2))
     profile = torch.where(length[:, None] > 1e-3 * waist_mm, moving, still)
     return peak * torch.exp(-((scale**2) * across2)) * profile
+
+
+def _cuts_of(engine: str) -> Callable[..., tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
+    """`cut_torch`, or what an engine has for it."""
+    if engine == "warp":
+        from surgisoft.scene.warp_dose import cut_warp
+
+        return cut_warp
+    return cut_compiled if engine == "compiled" else cut_torch
 
 
 def cut_torch(

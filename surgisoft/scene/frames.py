@@ -98,6 +98,12 @@ def invert(pose: Array) -> Array:
 def apply(pose: Array, points_mm: Array) -> Array:
     """Points (..., N, 3) mm of the pose's own frame, in its parent's frame; pose (..., 4, 4)."""
     pose, points_mm = _as_arrays(pose, points_mm)
+    if pose.ndim > 2 and _library(pose) is torch and pose.device.type != "cpu":
+        # A product of many 3 x 3 matrices takes an accelerator four times as long.
+        moved = pose[..., None, :3, 3]
+        for k in range(3):
+            moved = torch.addcmul(moved, points_mm[..., k : k + 1], pose[..., None, :3, k])
+        return moved
     turned = points_mm @ _library(pose).swapaxes(pose[..., :3, :3], -1, -2)
     return turned + pose[..., None, :3, 3]
 

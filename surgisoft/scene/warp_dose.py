@@ -73,3 +73,16 @@ class DoseKernel:
         changed = [wp.from_torch(one) for one in sums]
         arguments = [*given, *self._constants, *changed, RING]
         launch(kernels.deposit, len(rings), arguments, beams[0])
+
+
+def cut_warp(
+    peak: torch.Tensor, band_mm2: torch.Tensor, cut_dose: float
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """`ablation.cut_torch` as a kernel."""
+    peaks, bands = (t.float().contiguous() for t in (peak, band_mm2))
+    cut, gap = torch.empty((2, len(peaks)), dtype=torch.int64, device=peak.device).unbind(0)
+    burnt = torch.empty_like(peaks[:, 0])
+    found = [wp.from_torch(t) for t in (cut, gap, burnt)]
+    given = [wp.from_torch(peaks), wp.from_torch(bands), float(cut_dose), *found]
+    launch(kernels.ring_cuts, len(peaks), given, peaks)
+    return cut, gap, burnt

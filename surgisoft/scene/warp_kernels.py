@@ -882,3 +882,33 @@ def deposit(
                                 if kind == in_ring and after > wp.float64(peak[n, station]):
                                     peak[n, station] = wp.float32(after)
                                 dose[n, s] = wp.float32(after)
+
+
+@wp.kernel
+def ring_cuts(
+    peak: Singles2, band: Singles2, cut_dose: wp.float32, cut: Whole, gap: Whole, burnt: Singles
+):
+    """Cut stations, longest gap and burnt area of ring `tid`; see `ablation.cut_torch`."""
+    n = wp.tid()
+    count = peak.shape[1]
+    done = int(0)
+    longest = int(0)
+    run = int(0)
+    first = int(-1)
+    area = wp.float32(0.0)
+    for k in range(count):
+        if peak[n, k] >= cut_dose:
+            done = done + 1
+            area = area + band[n, k]
+            if first < 0:
+                first = k
+            run = 0
+        else:
+            run = run + 1
+            longest = wp.max(longest, run)
+    # The gap that goes on from the last station to the first.
+    if first >= 0:
+        longest = wp.max(longest, run + first)
+    cut[n] = wp.int64(done)
+    burnt[n] = area
+    gap[n] = wp.int64(longest)

@@ -88,15 +88,31 @@ class Backbone:
 
     def centreline(self, key_points: Tensor, base: Tensor | None = None) -> Tensor:
         """(..., K, 3) points in mm from key points (..., n, 3) in mm, same frame."""
-        return self.position @ key_points
+        return _weighted(self.position, key_points)
 
     def tangents(self, key_points: Tensor) -> Tensor:
         """(..., K, 3) unit tangents, base to tip, from key points (..., n, 3) in mm."""
-        return torch.nn.functional.normalize(self.derivative @ key_points, dim=-1)
+        return torch.nn.functional.normalize(_weighted(self.derivative, key_points), dim=-1)
 
     def tip_direction(self, key_points: Tensor, base: Tensor | None = None) -> Tensor:
         """(..., 3) unit tangent at the tip from key points (..., n, 3) in mm."""
-        return torch.nn.functional.normalize(self.derivative[-1] @ key_points, dim=-1)
+        last = _weighted(self.derivative[-1:], key_points)[..., 0, :]
+        return torch.nn.functional.normalize(last, dim=-1)
+
+
+FEW_POINTS = 8
+"""Up to so many key points an accelerator sums them faster than it multiplies by a matrix."""
+
+
+def _weighted(weights: Tensor, key_points: Tensor) -> Tensor:
+    """(..., K, 3): key points (..., n, 3) weighted by (K, n)."""
+    count = weights.shape[1]
+    if key_points.device.type == "cpu" or count > FEW_POINTS:
+        return weights @ key_points
+    total = weights[:, :1] * key_points[..., :1, :]
+    for k in range(1, count):
+        total = torch.addcmul(total, weights[:, k : k + 1], key_points[..., k : k + 1, :])
+    return total
 
 
 @dataclass(frozen=True)

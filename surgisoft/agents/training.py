@@ -6,6 +6,7 @@ that was interrupted continues as if it had not been. See `ppo` for the algorith
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import shutil
@@ -63,6 +64,10 @@ class Clock:
         self._last = now
 
 
+FEW_EPISODES = 256
+"""Up to so many episodes the compiled loops of a CPU evaluate faster than the graphs of a GPU."""
+
+
 @dataclass(frozen=True, eq=False)
 class Iteration:
     """Results of one iteration: a rollout and an update of every agent."""
@@ -102,6 +107,14 @@ class Training:
         self.iteration, self.clock = 0, Clock()
         self.best: dict[str, float] | None = None
         self.share = 0.0
+
+    @functools.cached_property
+    def evaluation_task(self) -> Task:
+        """The task in which policies are evaluated: on a CPU where that is faster."""
+        few = self.plan.preset.evaluation_episodes <= FEW_EPISODES
+        if self.task.world.device.type == "cpu" or not few:
+            return self.task
+        return make_task(self.plan.task, self.plan.task_config)
 
     @property
     def steps(self) -> int:
@@ -354,16 +367,18 @@ def _evaluated(run: RunFolder, training: Training) -> dict[str, float]:
     """
     if not training.processes.leads:
         return {"error_mm": math.nan}
-    preset = training.plan.preset
+    preset, task = training.plan.preset, training.evaluation_task
     actors = {
         agent: ScaledActor(
             acting(ppo.get_policy()),
             preset.action_kPa,
-            training.task.world.arms[agent].pneumatics.step_kPa,
-        ).eval()
+            task.world.arms[agent].pneumatics.step_kPa,
+        )
+        .eval()
+        .to(task.world.device)
         for agent, ppo in training.agents.items()
     }
-    found, log = evaluate_checkpoint(training.task, ActorPolicy(actors), preset.evaluation_episodes)
+    found, log = evaluate_checkpoint(task, ActorPolicy(actors), preset.evaluation_episodes)
     (run.path / REPLAYS).mkdir(exist_ok=True)
     save_episode(log, run.path / REPLAYS / f"{training.steps:012d}.npz")
     if is_better(found, training.best):

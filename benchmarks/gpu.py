@@ -1,6 +1,7 @@
 """An NVIDIA GPU: how far its episodes are from the CPU's, and its steps of the world and of PPO.
 
     python benchmarks/gpu.py [--tasks track_circle,circle_ablation] [--envs 4096,65536]
+    python benchmarks/gpu.py --compile
     python benchmarks/gpu.py --agree all
 
 With --agree a table of the largest differences between episodes stepped as CUDA graphs and the same
@@ -21,6 +22,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.control.policies import plan_of
+from surgisoft.agents.compiled_update import compile_arms
 from surgisoft.agents.distributed import Processes
 from surgisoft.agents.training import Training
 from surgisoft.tasks.base import Episodes, TaskState
@@ -97,9 +99,12 @@ def rate(work: Callable[[], object]) -> float:
     return calls / (time.perf_counter() - begin)
 
 
-def world(name: str, envs: int, device: torch.device) -> tuple[float, float, float]:
+def world(name: str, envs: int, device: torch.device, compiles: bool) -> tuple[float, float, float]:
     """Steps of the world per second with resets and observations; ms of a step, of observing."""
-    env = BatchedEnv(make_task(name, device=device), envs, 0, spread=True)
+    task = make_task(name, device=device)
+    if compiles:
+        compile_arms(task.world, envs)
+    env = BatchedEnv(task, envs, 0, spread=True)
     actions = {
         agent: env.action_limits_kPa[agent] * (2.0 * torch.rand(envs, size, device=device) - 1.0)
         for agent, size in env.action_sizes.items()
@@ -114,10 +119,10 @@ def world(name: str, envs: int, device: torch.device) -> tuple[float, float, flo
     )
 
 
-def ppo(name: str, envs: int, device: torch.device) -> tuple[float, float]:
+def ppo(name: str, envs: int, device: torch.device, compiles: bool) -> tuple[float, float]:
     """Steps of training per second, and seconds until the first iteration is done."""
     plan = plan_of(name, 1)
-    plan = replace(plan, preset=replace(plan.preset, envs=envs))
+    plan = replace(plan, preset=replace(plan.preset, envs=envs, compile=compiles))
     begin = time.perf_counter()
     training = Training(plan, make_task(name, plan.task_config, device), Processes())
     training.iterate()
@@ -136,6 +141,7 @@ def main() -> None:
     parser.add_argument("--tasks", default="track_circle,circle_ablation")
     parser.add_argument("--envs", default="4096,16384,65536")
     parser.add_argument("--agree", default="")
+    parser.add_argument("--compile", action="store_true", help="the arms by torch.compile, too")
     chosen = parser.parse_args()
     device = torch.device("cuda")
     print(f"{torch.cuda.get_device_name()}, PyTorch {torch.__version__}")
@@ -152,8 +158,8 @@ def main() -> None:
     for name in chosen.tasks.split(","):
         for envs in (int(count) for count in chosen.envs.split(",")):
             torch.cuda.reset_peak_memory_stats()
-            steps, step, observe = world(name, envs, device)
-            trained, first = ppo(name, envs, device)
+            steps, step, observe = world(name, envs, device, chosen.compile)
+            trained, first = ppo(name, envs, device, chosen.compile)
             memory = torch.cuda.max_memory_allocated() / 2**30
             cells = [f"{steps:,.0f}", f"{step:.2f}", f"{observe:.2f}", f"{trained:,.0f}"]
             row = [name, f"{envs:,}", *cells, f"{first:.1f}", f"{memory:.1f}"]

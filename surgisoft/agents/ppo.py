@@ -105,10 +105,10 @@ def make_ppo(env: JointEnv, preset: Preset, processes: Processes) -> dict[str, P
         ppo.storage.mini_batch_generator = functools.partial(gathered_once, each)
         if isinstance(ppo, SharedPPO):
             ppo.talk_once()
-        if preset.compile:
-            ppo.update = compiled_update(ppo)
-        elif torch.device(ppo.device).type == "cuda" and processes.count == 1:
+        if torch.device(ppo.device).type == "cuda" and processes.count == 1:
             ppo.update = GraphedUpdate(ppo)
+        elif preset.compile:
+            ppo.update = compiled_update(ppo)
         ppo.train_mode()
         by_agent[agent] = ppo
     return by_agent

@@ -81,7 +81,7 @@ class Preset:
     last_noise: Annotated[float, POSITIVE] | None = 0.005
     """The deviation falls to this, evenly in its logarithm, until the end; None: it is learned."""
     compile: bool = False
-    """Whether `torch.compile` builds the loss of an update, and on CUDA the arms' step."""
+    """Whether `torch.compile` builds the loss of an update; on a GPU the arms' step."""
     evaluate_every: Annotated[int, at_least(1)] = 100
     """Updates between two evaluations."""
     evaluation_episodes: Episodes = 32

@@ -38,7 +38,7 @@ class TrainingRequest:
     envs: int | None = None
     """Episodes side by side; None: the preset's, and fewer in a short training."""
     compile: bool = False
-    """Whether `torch.compile` builds the loss of an update, and on CUDA the arms' step."""
+    """Whether `torch.compile` builds the loss of an update; on a GPU the arms' step."""
     seed: int = 0
     """Seed of weights, noise and episodes."""
     target_error: float | None = None

@@ -148,14 +148,15 @@ def train(
     scene: SceneFolder = None,
     config: TaskConfig = None,
     device: Annotated[
-        str, typer.Option(metavar="cpu|cuda", help="Device of simulation and training.")
+        str, typer.Option(metavar="cpu|cuda", help="Device of simulation and training; cuda is an NVIDIA GPU.")
     ] = "cpu",
     compile_update: Annotated[
         bool,
         typer.Option(
             "--compile",
-            help="Compile the loss of an update with torch.compile. This needs a C++ compiler, or "
-            "Triton with --device cuda, and pays with few --envs (docs/training.md).",
+            help="Compile the loss of an update with torch.compile, which needs a C++ compiler and "
+            "pays with few --envs; with --device cuda the arms' step, which needs Triton "
+            "(docs/training.md).",
         ),
     ] = False,
     logger: Annotated[

@@ -1,6 +1,7 @@
 """The laser's dose against closed forms of Gaussian beams and hand-computed rings."""
 
 import math
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -301,6 +302,14 @@ def test_rings_run_either_way_round():
     np.testing.assert_allclose(one.offset_mm, two.offset_mm, atol=1e-9)
 
 
+def cuts_of_the_engines():
+    if find_spec("warp") is None:
+        return [cut_compiled]
+    from surgisoft.scene.warp_dose import cut_warp
+
+    return [cut_compiled, cut_warp]
+
+
 @given(st.lists(st.booleans(), min_size=1, max_size=30))
 @settings(max_examples=200, deadline=None)
 def test_longest_run_goes_round_the_ring(flags):
@@ -312,10 +321,11 @@ def test_longest_run_goes_round_the_ring(flags):
         best = max(best, run)
     assert longest_run(torch.tensor([flags])).item() == best
     peak, band = (~torch.tensor([flags])).float(), torch.rand(1, len(flags))
-    cut, gap, burnt = cut_compiled(peak, band, 1.0)
-    assert gap.item() == best
-    assert cut.item() == len(flags) - sum(flags)
-    assert burnt.item() == pytest.approx((band * peak).sum().item(), rel=1e-6)
+    for cuts in cuts_of_the_engines():
+        cut, gap, burnt = cuts(peak, band, 1.0)
+        assert gap.item() == best
+        assert cut.item() == len(flags) - sum(flags)
+        assert burnt.item() == pytest.approx((band * peak).sum().item(), rel=1e-6)
 
 
 def test_tissue_numbers_are_the_sources():

@@ -148,7 +148,10 @@ def train(
     scene: SceneFolder = None,
     config: TaskConfig = None,
     device: Annotated[
-        str, typer.Option(metavar="cpu|cuda", help="Device of simulation and training; cuda is an NVIDIA GPU.")
+        str,
+        typer.Option(
+            metavar="cpu|cuda", help="Device of simulation and training; cuda is an NVIDIA GPU."
+        ),
     ] = "cpu",
     compile_update: Annotated[
         bool,

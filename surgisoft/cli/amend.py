@@ -133,7 +133,7 @@ def amend(
         written.append(write_before_and_after(result, tables, model.name, replay))
     for name in result.refitted:
         print(f"{name}: the model had this effect already; its parameters were fitted again")
-    show_parameters(result.parameters)
+    show_parameters(result.parameters, result.in_words)
     if result.retuned:
         print(
             "the network's last layer was fitted again, which lowers the error on motion that was "

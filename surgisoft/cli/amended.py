@@ -30,14 +30,18 @@ def write_before_and_after(result, tables: dict, name: str, file: Path) -> Path:
     return file
 
 
-def show_parameters(parameters) -> None:
-    """Print the fitted parameters, one per line, and which of them are implausible."""
+def show_parameters(parameters, in_words: dict[str, str]) -> None:
+    """Print the fitted parameters, one per line, what they mean, and which are implausible."""
     from surgisoft.diagnosis.estimation.intervals import values_text
 
     for each in parameters:
         unit = f" {each.unit}" if each.unit else ""
         interval = f" ({each.interval_text})" if each.interval_text else ""
-        print(f"  {each.effect}: {each.name} = {values_text(each.value)}{unit}{interval}")
+        former = "" if each.before is None else f", before {values_text(each.before)}{unit}"
+        print(f"  {each.effect}: {each.name} = {values_text(each.value)}{unit}{interval}{former}")
+    for name, words in in_words.items():
+        if words:
+            print(f"{name}: {words}")
     for each in parameters:
         if not each.plausible:
             low, high = each.plausible_range

@@ -233,6 +233,8 @@ def _show(found) -> None:
     """Print the verdict, the ranking and the proposed experiment."""
     verdict, error = found.verdict, found.error_mm
     print(f"{verdict.kind}: {verdict.sentence}")
+    for name, words in found.in_words:
+        print(f"{name}, first estimate: {words}")
     if found.setup:
         _show_setup(found.setup)
         print(f"{found.seconds:.1f} s")

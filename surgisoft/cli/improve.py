@@ -140,7 +140,7 @@ def _show(result) -> None:
         print(f"round {number}: {done.verdict}: {done.sentence}")
         print(f"  {what}{competing}: error on the training part {done.error_training_mm:.4f} mm")
     if result.steps:
-        show_parameters(result.parameters)
+        show_parameters(result.parameters, result.in_words)
         fall = result.held_out
         width = max(len(name) for name, _ in result.steps) + 2
         part = "the held-out part"

@@ -10,13 +10,13 @@ been fitted by so much of the effects.
 
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
 from surgisoft.diagnosis.data_quality import FAR_ROWS, far_share
 from surgisoft.diagnosis.estimation.effects import fit_effects
-from surgisoft.diagnosis.estimation.intervals import Parameter
+from surgisoft.diagnosis.estimation.intervals import Estimates, Parameter, beside_former
 from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
 from surgisoft.diagnosis.other_models import name_of, open_model, refuse_predictions
@@ -160,7 +160,7 @@ class Amendment:
     refitted: tuple[str, ...]
     """Effects that the model had before and whose parameters were fitted again."""
     parameters: tuple[Parameter, ...]
-    """The fitted parameters in physical units."""
+    """The fitted parameters in physical units, beside those that the model had before."""
     held_out: Fall
     """The error on the held-out rows."""
     alone: Fall
@@ -188,6 +188,8 @@ class Amendment:
     """Name of the given model; empty for one that was given as an object."""
     recordings: tuple[str, ...] = ()
     """Names of the recordings."""
+    in_words: dict[str, str] = field(default_factory=dict)
+    """What the parameters mean, by effect; empty where the recordings do not tell."""
 
     @property
     def claimed(self) -> bool:
@@ -260,6 +262,7 @@ class Amendment:
             "error_effects_alone_mm": self.alone.to_json(),
             "error_training_mm": training.to_json(),
             "parameters": [parameter.to_json() for parameter in self.parameters],
+            "in_words": self.in_words,
             "network_retuned": self.retuned,
             "refit": None if self.refit is None else self.refit.to_json(),
             "notes": list(self.notes),
@@ -350,7 +353,8 @@ def amend(
             )
     if judged is not None and (refit == "always" or judged.winner is not None):
         joint = fit_together(problem, names, judged.candidates[0], progress=refit_progress)
-        better, retuned, parameters = joint.model, False, joint.parameters
+        better, retuned = joint.model, False
+        parameters, words = joint.parameters, joint.in_words
         refitted = tuple(name for name in names if name in model.effects)
         held_out = whole = sealed.opened(plain).final_check()
         # Both start from the same weights, whatever these were fitted to.
@@ -367,7 +371,7 @@ def amend(
         judged = None
         tell(f"fitting {' + '.join(names)}")
         fitted = fit_effects(problem, names)
-        parameters, refitted = fitted.parameters, fitted.refitted
+        parameters, words, refitted = fitted.parameters, fitted.in_words, fitted.refitted
         better, retuned = fitted.model, False
         shown_by_training = fall_of(problem, problem.with_model(better), fitted.p_value).significant
         if retune_network and shown_by_training:
@@ -386,6 +390,8 @@ def amend(
         # The residuals of the fit say nothing of a network that was re-tuned since.
         better.training_residuals = None if retuned else model.training_residuals
     better.fitted_rows = FittedRows.of([plain.history]).joined(model.fitted_rows)
+    found = Estimates(list(parameters), words)
+    parameters, words = beside_former(found, model, problem.covered_s)
     is_paired = both is not None and both.used
     # The paired difference holds for the network that predicted BEFORE.
     shown = fitted.model if is_paired else better
@@ -408,6 +414,7 @@ def amend(
         refit=judged,
         amended_from=given,
         recordings=tuple(each.name for each in recordings),
+        in_words=words,
     )
 
 

@@ -65,7 +65,7 @@ from surgisoft.measurement.histories import check_fits
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
-from surgisoft.surrogate.effects import known_effects
+from surgisoft.surrogate.effects import in_words, known_effects
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.workers import torch_threads
 
@@ -176,6 +176,8 @@ class Ranked:
     """Mean over blocks of log(error before / error with the effect)."""
     parameters: dict
     """Its parameters with units in their names."""
+    in_words: str = ""
+    """What its parameters mean, in words, of a named effect; empty for the others."""
 
 
 @dataclass(frozen=True)
@@ -237,6 +239,13 @@ class Diagnosis:
         """
         option = f" --before {before}" if self.change is not None else ""
         return self.next_command.format(model=model, data=data, before=option)
+
+    @property
+    def in_words(self) -> tuple[tuple[str, str], ...]:
+        """(named effect, what its parameters mean in words), where there is something to tell."""
+        named = {row.effect: row.in_words for row in self.ranking}
+        words = [(name, named.get(name, "")) for name in self.verdict.effects]
+        return tuple(each for each in words if each[1])
 
     @property
     def shown(self) -> tuple[Ranked, ...]:
@@ -470,6 +479,7 @@ def with_refit(result: Diagnosis, joint: Refit, problem: Problem) -> Diagnosis:
             replace(row, confidence=round(sure if place == 0 else min(row.confidence, most), 4))
             for place, row in enumerate(order)
         )
+        ranking = tuple(_as_fitted(row, joint) if row.effect in effects else row for row in ranking)
         competing, plan = joint.competing, None
         if kind == "ambiguous":
             plan = recommend(problem, effects[:MOST_RIVALS]).experiment
@@ -486,7 +496,7 @@ def with_refit(result: Diagnosis, joint: Refit, problem: Problem) -> Diagnosis:
             if verdict.effects or verdict.reason == "learned":
                 sentence = sentence_of(none, result.error_mm, [result.error_mm.before])
                 verdict = Verdict(none.kind, (), sentence, round(quiet, 4), none.reason)
-                ranking = tuple(replace(row, confidence=0.0) for row in ranking)
+                ranking = tuple(replace(row, confidence=0.0, in_words="") for row in ranking)
                 command, competing, plan = next_command(none), (), None
     return replace(
         result,
@@ -498,6 +508,12 @@ def with_refit(result: Diagnosis, joint: Refit, problem: Problem) -> Diagnosis:
         refit=joint,
         next_command=command,
     )
+
+
+def _as_fitted(row: Ranked, joint: Refit) -> Ranked:
+    """A row of the ranking with the parameters that were fitted together with the network."""
+    fitted = joint.of(row.effect)
+    return replace(row, parameters=fitted.parameters, in_words=fitted.in_words)
 
 
 def result_of(found: Findings, decision: Decision | None = None) -> Diagnosis:
@@ -650,6 +666,8 @@ def _ranked(found: Findings, score: Score, decision: Decision) -> Ranked:
     """One row of the ranking."""
     selection, chances = found.selection, decision.probabilities
     sure = chances.effects.get(score.effect, 0.0)
+    effect = selection.in_best_form(score, _beside(found, score, decision))
+    named = effect is not None and score.effect in decision.effects
     if score.effect in chances.two:
         sure = max(sure, chances.pair)
     return Ranked(
@@ -661,8 +679,20 @@ def _ranked(found: Findings, score: Score, decision: Decision) -> Ranked:
         ci95=rmse_interval(found.problem, score.losses, selection.validation.counts),
         p_value=float(score.p_value),
         log_gain=float(score.log_gain.mean()),
-        parameters=selection.parameters(score),
+        parameters={} if effect is None else {q.name: q.value for q in effect.quantities()},
+        in_words=in_words(effect.readings(found.problem.covered_s)) if effect and named else "",
     )
+
+
+def _beside(found: Findings, score: Score, decision: Decision) -> tuple[int, ...]:
+    """Sensitivities that are fitted beside an effect: those of the others, where two are named."""
+    if decision.kind != "several" or score.effect not in decision.effects:
+        return ()
+    for proposal in found.proposals:
+        if set(proposal.effects) == set(decision.effects):
+            others = (each.option for each in proposal.scores if each.effect != score.effect)
+            return sum((option.chosen for option in others), ())
+    return ()
 
 
 def _share(value: float) -> float:

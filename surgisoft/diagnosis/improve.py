@@ -12,12 +12,17 @@ what of those on BEFORE can be learned. The network, which was fitted to neither
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 
 from surgisoft.diagnosis.amend import Fall, Track, fall_of, of_change, track_of
 from surgisoft.diagnosis.diagnose import Diagnosis, diagnose, diagnose_change, with_setup
 from surgisoft.diagnosis.estimation.effects import Fitted, fit_effects, fit_plausible
-from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
+from surgisoft.diagnosis.estimation.intervals import (
+    Estimates,
+    Parameter,
+    beside_former,
+    values_text,
+)
 from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
 from surgisoft.diagnosis.other_models import name_of, open_model, refuse_predictions
@@ -90,6 +95,7 @@ class _Made:
     known: TrainingResiduals | None
     """Residuals on the rows of its fit; None where the network was re-tuned since."""
     parameters: tuple[Parameter, ...] = ()
+    in_words: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +107,7 @@ class Improvement:
     rounds: tuple[Round, ...]
     """What happened; the last one gives the reason why the loop ended."""
     parameters: tuple[Parameter, ...]
-    """The fitted parameters of all added effects."""
+    """The fitted parameters of all added effects, beside those that the given model had."""
     held_out: Fall
     """The error on the held-out rows, before the first and after the last round; of the paired
     difference where there is one."""
@@ -123,6 +129,8 @@ class Improvement:
     model_error: Fall | None = None
     """The error of the model itself on the held-out rows, where the others are paired
     differences."""
+    in_words: dict[str, str] = field(default_factory=dict)
+    """What the parameters mean, by effect; empty where the recordings do not tell."""
 
     @property
     def interrupted(self) -> bool:
@@ -181,6 +189,7 @@ class Improvement:
             "error_mm": self.held_out.to_json(),
             "rounds": [each.to_json() for each in self.rounds],
             "parameters": [parameter.to_json() for parameter in self.parameters],
+            "in_words": self.in_words,
             "notes": list(self.notes),
             "seconds": self.seconds,
             "amended_from": self.amended_from,
@@ -317,7 +326,7 @@ def improve(
                     known = fitted.model.training_residuals
                     discrepancy = model_discrepancy(fitted.model, problem.noise_mm)
                     problem = replace(problem, discrepancy_mm=discrepancy)
-                made.append(_Made(fitted.model, known, fitted.parameters))
+                made.append(_Made(fitted.model, known, fitted.parameters, fitted.in_words))
                 note(replace(_step(current, name, found, fall.after), together=together))
                 current = replace(current, sentence=f"named beside {name} by the same diagnosis")
             if not going:
@@ -329,7 +338,7 @@ def improve(
                 "a re-tuned network lowers the squared error on held-out motion by "
                 f"{100 * tuned.gain:.0f} %"
             )
-            made.append(_Made(tuned.model, None, made[-1].parameters))
+            made.append(replace(made[-1], model=tuned.model, known=None))
             note(Round("surrogate_undertrained", why, NETWORK, (), None, after))
 
     try:
@@ -354,10 +363,12 @@ def improve(
     for done in rounds:
         final = next(after_round) if done.step is not None else final
         shown.append(replace(done, error_mm=fall_of(held_out, final).after))
+    last = Estimates(list(made[-1].parameters), made[-1].in_words)
+    parameters, words = beside_former(last, model, problem.covered_s)
     result = Improvement(
         model=final_model,
         rounds=tuple(shown),
-        parameters=made[-1].parameters,
+        parameters=parameters,
         held_out=fall_of(held_out, final),
         tracks=(track_of(problem, problem.with_model(final_model)), track_of(held_out, final)),
         seconds=time.perf_counter() - begin,
@@ -367,6 +378,7 @@ def improve(
         recordings=tuple(each.name for each in recordings),
         change=None if both is None else both.change,
         model_error=fall_of(whole, whole.with_model(final_model)) if is_paired else None,
+        in_words=words,
     )
     if result.interrupted:
         raise Interrupted(result)

@@ -44,7 +44,7 @@ from surgisoft.diagnosis.statistics import (
 )
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.progress import Progress, silent
-from surgisoft.surrogate.effects import Memoryless, Stage, known_effects
+from surgisoft.surrogate.effects import Memoryless, Stage, in_words, known_effects
 from surgisoft.surrogate.model import ArmModel, Validation
 from surgisoft.surrogate.training import Data, JointTraining, train_jointly
 from surgisoft.workers import torch_threads, workers
@@ -146,6 +146,8 @@ class RefitCandidate:
     """Whether the effect's parameters lay in their ranges after every training."""
     parameters: dict
     """Its parameters after the training of the first seed, with units in their names."""
+    in_words: str = ""
+    """What these parameters mean, in words."""
 
     @property
     def named(self) -> bool:
@@ -749,6 +751,9 @@ def _score(
         epochs=rung[label][0].epochs,
         plausible=all(effect.plausible() for some in fitted for effect in some),
         parameters={q.name: q.value for effect in fitted[0] for q in effect.quantities()},
+        in_words="; ".join(
+            in_words(effect.readings(split.problem.covered_s)) for effect in fitted[0]
+        ),
     )
 
 
@@ -827,6 +832,8 @@ class JointFit:
     """The given model, its network trained for as many epochs without the effects it lacked."""
     parameters: tuple[Parameter, ...]
     """The effects' parameters; intervals are not known, so their ends are the values."""
+    in_words: dict[str, str]
+    """What the parameters mean, by effect."""
 
 
 ALL_ROWS = 10**9
@@ -869,7 +876,9 @@ def fit_together(
     )
     model = trained[0].replace(validation=validation).eval().requires_grad_(False)
     model.training_residuals = model.residuals_on([problem.history])
-    return JointFit(model, trained[1], tuple(_parameters(model, effects)))
+    seconds = problem.covered_s
+    words = {name: in_words(model.effects[name].readings(seconds)) for name in effects}
+    return JointFit(model, trained[1], tuple(_parameters(model, effects)), words)
 
 
 def _parameters(model: ArmModel, effects: Iterable[str]) -> Iterator[Parameter]:

@@ -526,6 +526,12 @@ class Problem:
         return float(np.sqrt(np.mean(self.noise_mm**2)))
 
     @property
+    def covered_s(self) -> float | None:
+        """Time that the longest recording covers, s; None where they have no times."""
+        timed = self.table.timed[self.index.numpy()]
+        return float(self.time_s[timed].max()) if timed.any() else None
+
+    @property
     def residual(self) -> np.ndarray:
         """(S, n, 3) measured less predicted, mm."""
         return self.measured - self.predicted

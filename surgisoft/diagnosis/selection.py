@@ -342,15 +342,16 @@ class ModelSelection:
             answer[name] = float((self.losses(rest).sum() - everything.sum()) / total)
         return answer
 
-    def parameters(self, score: Score) -> dict:
-        """Name with unit -> value, of an effect in its best single candidate."""
+    def in_best_form(self, score: Score, base: tuple[int, ...] = ()) -> Effect | None:
+        """An effect in its best single candidate, at its amplitudes beside a base."""
         single = [option for option in self.options[score.effect] if option.candidate is not None]
         option = max(
             single,
-            key=lambda w: float(self.log_ratio(self.losses(), self.losses(w.chosen)).mean()),
+            key=lambda w: float(
+                self.log_ratio(self.losses(base), self.losses(base + w.chosen)).mean()
+            ),
         )
-        effect = self.in_place(option)
-        return {} if effect is None else {q.name: q.value for q in effect.quantities()}
+        return self.in_place(option, base)
 
 
 # Relaxed forms ------------------------------------------------------------------------------

@@ -163,7 +163,7 @@ def diagnosis(**fields) -> SimpleNamespace:
         "error_mm": SimpleNamespace(before=0.5, floor=0.05, best_achievable=0.1), "track": None,
         "setup": None, "next_command": "", "next_experiment": None, "refit": None, "checks": (),
         "shown": (), "not_testable": (), "implausible": (), "seconds": 1.5, "in_fit": 0.0,
-        "left_out": "held-out blocks", "change": None,
+        "left_out": "held-out blocks", "change": None, "in_words": (),
     }  # fmt: skip
     found = result(**(values | fields))
     found.command = lambda *files: Diagnosis.command(found, *files)
@@ -232,7 +232,7 @@ def test_diagnose_prints_candidates_and_the_next_step(bench, capsys, monkeypatch
         verdict=SimpleNamespace(kind="ambiguous", sentence="creep or leak"), refit=refit,
         shown=[row], checks=("the clock is even",), next_experiment=plan,
         not_testable=[SimpleNamespace(effect="drift", reason="too short")],
-        implausible=("payload", "twist"),
+        implausible=("payload", "twist"), in_words=(("creep", "half of it after 3 s"),),
         next_command="surgisoft next-experiment {model} {data}{before} -o NEW.csv", change=CHANGE,
     )  # fmt: skip
     rec = str(bench / "bench.parquet")
@@ -240,6 +240,7 @@ def test_diagnose_prints_candidates_and_the_next_step(bench, capsys, monkeypatch
     out = printed(
         capsys, monkeypatch, target, found, "diagnose", "default", rec, "--before", rec
     )  # fmt: skip
+    assert "creep, first estimate: half of it after 3 s\n" in out
     assert "check: the clock is even\n" in out
     assert re.search(r"creep +0\.90 +50\.0% +25\.0% +0\.1500 \[0\.1000, 0\.2000\] mm", out)
     assert "not testable: drift: too short" in out
@@ -287,9 +288,10 @@ def test_the_page_of_a_diagnosis_has_the_command_that_is_printed(
 
 PARAMETER = SimpleNamespace(
     effect="creep", name="tau", unit="s", interval_text="2 to 4", value=3.0, plausible=False,
-    plausible_range=(5.0, 9.0), source="Smith 2001",
+    plausible_range=(5.0, 9.0), source="Smith 2001", before=None,
 )  # fmt: skip
 UNITLESS = SimpleNamespace(**(vars(PARAMETER) | {"unit": "", "interval_text": "", "name": "share"}))
+HAD = SimpleNamespace(**(vars(PARAMETER) | {"before": 2.5}))
 
 
 def test_amend_and_improve_write_nothing_where_nothing_is_claimed(
@@ -305,7 +307,7 @@ def test_amend_and_improve_write_nothing_where_nothing_is_claimed(
     found = result(
         claimed=False, rounds=rounds, steps=[("creep", 0.3)], parameters=[PARAMETER, UNITLESS],
         held_out=SimpleNamespace(before=0.5, floor=0.1, in_fit=0.0), model_error=None,
-        sentence="no significant fall",
+        sentence="no significant fall", in_words={"creep": "half of it after 3 s", "leak": ""},
     )  # fmt: skip
     command = ["improve", "default", rec, "-o", new, "--json", numbers + ".json"]
     target = "surgisoft.diagnosis.improve.improve"
@@ -313,6 +315,7 @@ def test_amend_and_improve_write_nothing_where_nothing_is_claimed(
     assert "  + creep, fitted together with the network (or leak): error on the training" in out
     assert "round 2: nothing_missing: it fits\n  no further effect: error" in out
     assert "  creep: tau = 3 s (2 to 4)\n  creep: share = 3\n" in out
+    assert "\ncreep: half of it after 3 s\nimplausible: creep" in out
     assert "implausible: creep tau = 3, expected 5 to 9 s (Smith 2001)\n" in out
     assert re.search(r"before +0\.5000 mm on the held-out part\n\+ creep +0\.3000 mm\nfloor", out)
     assert out.endswith(f"no significant fall\n{new} was not written\n")
@@ -322,14 +325,16 @@ def test_amend_and_improve_write_nothing_where_nothing_is_claimed(
     out = printed(capsys, monkeypatch, target, found, *command[:-2], code=1)
     assert out == f"no significant fall\n{new} was not written\n"
     tried = result(
-        claimed=False, effects=("creep",), refitted=("creep",), parameters=[], retuned=True,
+        claimed=False, effects=("creep",), refitted=("creep",), parameters=[HAD], retuned=True,
         refit=SimpleNamespace(sentence="creep lowers it"), sentence="no significant fall",
+        in_words={},
     )  # fmt: skip
     out = printed(
         capsys, monkeypatch, "surgisoft.diagnosis.amend.amend", tried,
         "amend", "default", "--effect", "creep", "--data", rec, "-o", new, code=1,
     )  # fmt: skip
     assert "creep: the model had this effect already; its parameters were fitted again\n" in out
+    assert "  creep: tau = 3 s (2 to 4), before 2.5 s\n" in out
     assert "the network's last layer was fitted again, which lowers the error on motion th" in out
     assert "creep lowers it, with parts of the training data left out\n" in out
     assert f"{new} was not written; --anyway writes it nevertheless" in out
@@ -560,7 +565,7 @@ def test_what_is_claimed_is_written_with_its_page(bench, tmp_path, capsys, monke
     options = ["-o", new, "--json", numbers, "--report", page, "--replay", replay]
     found = result(
         claimed=True, rounds=[], steps=[], parameters=[], effects=("creep",), refitted=(),
-        retuned=False, refit=None, sentence="the error falls",
+        in_words={}, retuned=False, refit=None, sentence="the error falls",
         model=SimpleNamespace(summary=lambda: "an arm", fitted_rows=None),
     )  # fmt: skip
     out = printed(

@@ -1,6 +1,7 @@
 """The answer on robots whose truth is known and has other forms than the model's effects."""
 
 import json
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -74,7 +75,13 @@ def test_command_writes_the_promised_json(tmp_path, capsys):
         said["ranking"][0]
     )
     assert {"ambiguous_with", "next_experiment", "checks", "seconds"} <= set(said)
-    assert "misalignment is missing" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "misalignment is missing" in printed
+    words = said["ranking"][0]["in_words"]
+    assert f"\nmisalignment, first estimate: {words}\n" in printed
+    turn = math.degrees(said["ranking"][0]["parameters"]["turn_rad"][0])
+    assert f"frame turned by {turn:+.2g} degrees about x" in words
+    assert [row["in_words"] for row in said["ranking"][1:]] == [""] * (len(said["ranking"]) - 1)
     after = {p.name: p.read_bytes() for p in (tmp_path / "arm").iterdir()}
     assert after == before
 
@@ -149,6 +156,17 @@ def test_an_effect_that_is_plausible_only_beside_another_is_ranked():
     result = result_of(both, Decision("several", two, 0.85, chances))
     assert [row.effect for row in result.ranking] == ["creep", "misalignment"]
     assert [row.confidence for row in result.ranking] == [0.9, 0.85]
+    assert [name for name, _ in result.in_words] == list(two)
+    alone = result_of(found, Decision("identified", ("creep",), 0.9, chances))
+    beside, own = (each.ranking[0].parameters["amount_share"] for each in (result, alone))
+    amounts = amount_of(found, first[0], second.option.chosen), amount_of(found, first[0])
+    assert beside / own == pytest.approx(amounts[0] / amounts[1], rel=1e-5)
+    assert beside != own
+
+
+def amount_of(found, score, base=()) -> float:
+    """Amplitude of an effect with one, fitted beside a base."""
+    return found.selection.validation.amplitudes(base + score.option.chosen)[-1]
 
 
 def test_what_was_taken_off_the_bench_is_not_named(tmp_path, capsys):

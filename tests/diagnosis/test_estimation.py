@@ -10,7 +10,14 @@ import torch
 from surgisoft.diagnosis.candidates import with_effect
 from surgisoft.diagnosis.estimation import network_error
 from surgisoft.diagnosis.estimation.effects import fit_effects
-from surgisoft.diagnosis.estimation.intervals import DRAWS, Fitted, Parameter, intervals
+from surgisoft.diagnosis.estimation.intervals import (
+    DRAWS,
+    Estimates,
+    Fitted,
+    Parameter,
+    beside_former,
+    intervals,
+)
 from surgisoft.diagnosis.estimation.least_squares import (
     Fit,
     Prediction,
@@ -127,7 +134,7 @@ def test_an_interval_holds_a_further_draw_with_its_probability():
     )
     known = Fitted(fit, np.eye(1), np.array([[spread**2]]))
     found = intervals({"payload": effect}, {"payload.tip_sag": effect.tip_sag}, known)
-    sag = next(each for each in found if each.name == "tip_sag_mm")
+    sag = next(each for each in found.parameters if each.name == "tip_sag_mm")
     drawn = np.sort(around + spread * np.random.default_rng(0).standard_normal(DRAWS))
     assert DRAWS == 400
     assert np.ravel(sag.value) == pytest.approx([2.0])
@@ -135,6 +142,8 @@ def test_an_interval_holds_a_further_draw_with_its_probability():
     high = drawn[389] + 0.975 * (drawn[390] - drawn[389])
     assert np.ravel(sag.low) == pytest.approx([low], abs=1e-6)
     assert np.ravel(sag.high) == pytest.approx([high], abs=1e-6)
+    said = f"arm sag by 2 mm (95 %: {low:.3g} to {high:.3g}) at the tip"
+    assert said in found.in_words["payload"]
 
 
 def test_intervals_shrink_with_the_data():
@@ -191,6 +200,15 @@ def test_hysteresis_that_the_model_has_is_fitted_anew_not_doubled():
     fitted = fit_effects(problem, ["hysteresis"])
     assert list(fitted.model.effects) == ["hysteresis"]
     assert fitted.refitted == ("hysteresis",)
+    found = Estimates(list(fitted.parameters), fitted.in_words)
+    parameters, words = beside_former(found, weaker, problem.covered_s)
+    for now, quantity in zip(parameters, weaker.effects["hysteresis"].quantities(), strict=True):
+        assert (now.name, now.before) == (quantity.name, quantity.value)
+    now, then = (
+        float(text.split("loop of ")[1].split()[0]) for text in words["hysteresis"].split(";")
+    )
+    assert then / now == pytest.approx(0.5, abs=0.1)
+    assert beside_former(found, problem.model.replace(effects={}), None)[0] == fitted.parameters
     held_out = problem_of(weaker, [recording], part="held_out")
     before, after = rms(held_out.residual), rms(held_out.with_model(fitted.model).residual)
     assert before > 2 * np.sqrt(3) * NOISE_MM

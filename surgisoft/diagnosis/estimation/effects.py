@@ -3,7 +3,7 @@
 import copy
 import itertools
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -59,6 +59,8 @@ class Fitted:
     p_value: float | None = None
     """Probability of so large amplitudes of the new effects by noise and the network's own error
     alone; None where no effect is new, or one has so many values that a ridge holds them."""
+    in_words: dict[str, str] = field(default_factory=dict)
+    """What the parameters mean, by effect; empty where nothing is known."""
 
 
 def fit_effects(problem: Problem, names: list[str]) -> Fitted:
@@ -85,19 +87,23 @@ def fit_effects(problem: Problem, names: list[str]) -> Fitted:
         if small:
             fits[tuple(small)] = fit_all(model, problem, small)
     parameters, chance, network = [], None, NetworkError.of(problem)
+    words: dict[str, str] = {}
     for keys, fit in fits.items():
         effects = {key: model.effects[key] for key in keys}
         free = free_parameters(model, keys)
         if len(keys) == 1 and keys[0] in large:
             free = {f"{keys[0]}.{k}": p for k, p in effects[keys[0]].amplitudes().items()}
         known, *ends = (with_covariance(each, problem, network) for each in (fit, *others))
-        parameters += intervals(effects, free, known, ends)
+        found = intervals(effects, free, known, ends, problem.covered_s)
+        parameters += found.parameters
+        words |= found.in_words
         new = _are_new_amplitudes(model, keys, refitted)
         if not large and new.any():
             chance = p_value(known, new)
     order = {name: position for position, name in enumerate(names)}
     parameters.sort(key=lambda parameter: order[parameter.effect])
-    return Fitted(model.eval().requires_grad_(False), tuple(parameters), refitted, chance)
+    words = {name: words[name] for name in names}
+    return Fitted(model.eval().requires_grad_(False), tuple(parameters), refitted, chance, words)
 
 
 def _best_end(problem: Problem, name: str, models: list[ArmModel]) -> tuple[ArmModel, list[Fit]]:
@@ -149,11 +155,16 @@ def fit_plausible(problem: Problem, fitted: Fitted, names: list[str], name: str)
     effects = {key: model.effects[key] for key in small}
     free = free_parameters(model, small, held=name)
     known = with_covariance(fit, problem, NetworkError.of(problem))
-    found = intervals(effects, free, known)
+    found = intervals(effects, free, known, seconds=problem.covered_s)
     rest = [p for p in fitted.parameters if p.effect not in small]
     order = {each: position for position, each in enumerate(names)}
-    parameters = sorted([*found, *rest], key=lambda parameter: order[parameter.effect])
-    return replace(fitted, model=model.eval().requires_grad_(False), parameters=tuple(parameters))
+    parameters = sorted([*found.parameters, *rest], key=lambda parameter: order[parameter.effect])
+    return replace(
+        fitted,
+        model=model.eval().requires_grad_(False),
+        parameters=tuple(parameters),
+        in_words=fitted.in_words | found.in_words,
+    )
 
 
 @torch.no_grad()

@@ -25,7 +25,8 @@ at about the same misfit take their share of the draws.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtrc, ndtri, stdtrit
@@ -36,7 +37,8 @@ from surgisoft.diagnosis.estimation.least_squares import Fit, set_vector
 from surgisoft.diagnosis.estimation.network_error import NetworkError
 from surgisoft.diagnosis.residuals import Problem
 from surgisoft.diagnosis.statistics import block_sums
-from surgisoft.surrogate.effects import Effect
+from surgisoft.surrogate.effects import Effect, in_words
+from surgisoft.surrogate.model import ArmModel
 
 DRAWS = 400
 """Draws of the values."""
@@ -66,6 +68,8 @@ class Parameter:
     """Lowest and highest plausible value."""
     source: str
     """Where the range comes from."""
+    before: float | list | None = None
+    """Value that the model had before; None where it lacked the effect."""
 
     @property
     def may_be_plausible(self) -> bool:
@@ -122,6 +126,15 @@ def values_text(value: float | list) -> str:
         return f"{flat.size} values, least {flat.min():.3g}, largest {flat.max():.3g}"
     text = ", ".join(f"{number:.4g}" for number in flat)
     return text if flat.size == 1 else f"[{text}]"
+
+
+class Estimates(NamedTuple):
+    """What a fit tells of its effects."""
+
+    parameters: list[Parameter]
+    """Every quantity with its interval."""
+    in_words: dict[str, str]
+    """What the quantities mean, by effect (`Effect.readings`); empty where nothing is known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,27 +219,29 @@ def intervals(
     parameters: Mapping[str, Tensor],
     fit: Fitted,
     others: Sequence[Fitted] = (),
-) -> list[Parameter]:
-    """Every quantity of the fitted effects with its 95 % interval.
+    seconds: float | None = None,
+) -> Estimates:
+    """Every quantity of the fitted effects with its 95 % interval, and what they mean in words.
 
     effects: by name; parameters: those that the fit's values were written to, in order. others:
     fits of the same values that ended elsewhere; each has the share of the draws that its
-    likelihood gives it.
+    likelihood gives it. seconds: time that the recordings cover, s.
     """
     rng = np.random.default_rng(0)
     weights = np.array([each.fit.likelihood(fit.fit.misfit) for each in (fit, *others)])
     counts = np.round(DRAWS * weights / weights.sum()).astype(int)
-    seen = []
+    seen: list[list] = []
+    read: list[list[float]] = []
     for each, count in zip((fit, *others), counts, strict=True):
         for values in each.draws(count, rng):
             set_vector(parameters, values)
             seen.append([quantity.value for e in effects.values() for quantity in e.quantities()])
+            read.append([r.value for e in effects.values() for r in e.readings(seconds)])
     set_vector(parameters, fit.fit.values)
     answer: list[Parameter] = []
     for name, effect in effects.items():
         for quantity in effect.quantities():
-            drawn = np.array([row[len(answer)] for row in seen], dtype=np.float64)
-            low, high = np.quantile(drawn, [0.025, 0.975], axis=0, method="weibull").tolist()
+            low, high = _ends([row[len(answer)] for row in seen])
             answer.append(
                 Parameter(
                     effect=name,
@@ -240,4 +255,33 @@ def intervals(
                     source=quantity.source,
                 )
             )
-    return answer
+    ends, words = iter(zip(*_ends(read), strict=True)), {}
+    for name, effect in effects.items():
+        readings = effect.readings(seconds)
+        words[name] = in_words(readings, [next(ends) for _ in readings])
+    return Estimates(answer, words)
+
+
+def _ends(drawn: list) -> list:
+    """Ends of the 95 % interval of drawn values, each shaped as one of them."""
+    values = np.array(drawn, dtype=np.float64)
+    return np.quantile(values, [0.025, 0.975], axis=0, method="weibull").tolist()
+
+
+def beside_former(
+    found: Estimates, model: ArmModel, seconds: float | None
+) -> tuple[tuple[Parameter, ...], dict[str, str]]:
+    """Parameters and words of effects, with those that a model had before, where it has them.
+
+    seconds: time that the recordings cover, s.
+    """
+    had = {name: model.effects[name] for name in found.in_words if name in model.effects}
+    former = {(name, q.name): q.value for name, effect in had.items() for q in effect.quantities()}
+    parameters = (
+        replace(each, before=former.get((each.effect, each.name))) for each in found.parameters
+    )
+    words = dict(found.in_words)
+    for name, effect in had.items():
+        then = in_words(effect.readings(seconds))
+        words[name] = f"{words[name]}; before: {then}" if words[name] and then else words[name]
+    return tuple(parameters), words

@@ -77,7 +77,7 @@ def amend_page(result: Amendment, title: str, about: str) -> Page:
         tone="good" if result.claimed else "warn",
         parts=[
             facts,
-            Section("Parameters", [parameter_table(result.parameters)]),
+            Section("Parameters", parameter_parts(result)),
             Section(
                 "Error over time",
                 track_charts(
@@ -125,14 +125,22 @@ def _use(fall: Fall) -> str:
     return "not used in the fit"
 
 
+def parameter_parts(result: Amendment | Improvement) -> list[Part]:
+    """What the fitted parameters mean, and the table of them."""
+    words = [Text(f"{name}: {words}.") for name, words in result.in_words.items() if words]
+    return [*words, parameter_table(result.parameters)]
+
+
 def parameter_table(parameters: tuple[Parameter, ...]) -> Table:
-    """Every fitted quantity with interval, unit and plausible range."""
+    """Every fitted quantity with interval, former value, unit and plausible range."""
+    had = any(each.before is not None for each in parameters)
     rows = [
         (
             each.effect,
             each.name,
             values_text(each.value),
             each.interval_text or "-",
+            *([] if not had else ["-" if each.before is None else values_text(each.before)]),
             each.unit or "-",
             " to ".join(map(values_text, each.plausible_range))
             + ("" if each.plausible else ": outside"),
@@ -140,7 +148,9 @@ def parameter_table(parameters: tuple[Parameter, ...]) -> Table:
         )
         for each in parameters
     ]
-    header = ["effect", "parameter", "value", "95 % interval", "unit", "plausible", "source"]
+    before = ["before"] if had else []
+    header = ["effect", "parameter", "value", "95 % interval", *before, "unit", "plausible"]
+    header.append("source")
     return Table(header, rows)
 
 
@@ -234,7 +244,7 @@ def improve_page(
         Section("What it is worth", [*worth, Text(_worth(result)), _rounds(result.rounds)])
     )
     if result.parameters:
-        parts.append(Section("Parameters", [parameter_table(result.parameters)]))
+        parts.append(Section("Parameters", parameter_parts(result)))
     if result.diagnoses:
         parts.append(what_is_left(result))
     parts.append(Section("How to read this", how_to_read(fall)))

@@ -304,7 +304,8 @@ def _parameters(found: Diagnosis) -> Section:
         for name, value in row.parameters.items()
     ]
     note = Text("First estimates; `surgisoft amend` fits them through the whole model.")
-    return Section("Parameters", [Table(["effect", "parameter", "value"], rows), note])
+    words = [Text(f"{name}: {words}.") for name, words in found.in_words]
+    return Section("Parameters", [*words, Table(["effect", "parameter", "value"], rows), note])
 
 
 def _number(value) -> str:

@@ -27,6 +27,7 @@ from surgisoft.surrogate.effects.line_lag import LineLag
 from surgisoft.surrogate.effects.misalignment import Misalignment
 from surgisoft.surrogate.effects.payload import Payload
 from surgisoft.surrogate.effects.rate_dependence import RateDependence
+from surgisoft.surrogate.effects.readings import Reading, in_words
 from surgisoft.surrogate.effects.softening import Softening
 from surgisoft.surrogate.effects.stiffening import Stiffening
 from surgisoft.surrogate.effects.twist import Twist
@@ -59,10 +60,12 @@ __all__ = [
     "Hypothesis",
     "Memoryless",
     "Quantity",
+    "Reading",
     "Stage",
     "effect_class",
     "free_name",
     "hypothesis_of",
+    "in_words",
     "known_effects",
     "make_effect",
     "named_effect",

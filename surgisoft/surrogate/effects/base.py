@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from surgisoft.errors import InputError
+from surgisoft.surrogate.effects.readings import Reading
 
 Stage = Literal["line", "material", "body", "sensor"]
 STAGES: tuple[Stage, ...] = ("line", "material", "body", "sensor")
@@ -85,6 +86,11 @@ class Quantity:
         return all(self.low <= value <= self.high for value in _leaves(self.value))
 
 
+def _without_unit(quantity: Quantity) -> str:
+    """Name of a quantity in words, without its unit."""
+    return quantity.name.removesuffix(f"_{quantity.unit}").replace("_", " ")
+
+
 def _leaves(value) -> Iterator[float]:
     if isinstance(value, list | tuple):
         for item in value:
@@ -93,6 +99,8 @@ def _leaves(value) -> Iterator[float]:
         yield float(value)
 
 
+TEN_MINUTES = 600.0
+"""Time for which slow effects are stated where the recordings' own is not known, s."""
 OLD_NAMES = {
     "strengths": "amplitudes",
     "shapes": "nonlinear_parameters",
@@ -228,6 +236,18 @@ class Effect(nn.Module, ABC):
     @abstractmethod
     def quantities(self) -> list[Quantity]:
         """The parameters in units that a person reads, with their plausible ranges."""
+
+    def readings(self, seconds: float | None = None) -> list[Reading]:
+        """What the parameters mean, in words; as many readings whatever the parameters are.
+
+        seconds: time that recordings cover, s; None where it is not known. By default every
+        quantity that is a single number.
+        """
+        return [
+            Reading(f"{_without_unit(each)} {{}}", float(each.value), each.unit)
+            for each in self.quantities()
+            if not isinstance(each.value, list | tuple)
+        ]
 
     def implausible(self) -> list[Quantity]:
         """The parameters outside their plausible range."""

@@ -25,6 +25,7 @@ from surgisoft.surrogate.effects.base import (
 )
 from surgisoft.surrogate.effects.beam import Beam, cross, displaced
 from surgisoft.surrogate.effects.hypothesis import Hypothesis
+from surgisoft.surrogate.effects.readings import MOST_PERCENT, Reading
 
 AROUND = 16
 """Directions of the support that identification tries."""
@@ -125,6 +126,17 @@ class Contact(Memoryless):
             Quantity("rise_rad", value_of(self.rise), "rad", -1.6, 1.6, "any direction"),
             Quantity("offset_mm", offset, "mm", -1.5 * length, 1.5 * length, reach),
             Quantity("key_point", self.point, "", 0, self.lever.shape[0], "which one meets it"),
+        ]
+
+    def readings(self, seconds: float | None = None) -> list[Reading]:
+        """Place of the support (mm), and how much of the depth it pushes back (%)."""
+        normal = ", ".join(f"{part:.2f}" for part in self.normal.detach().tolist())
+        place = f"support of key point {self.point + 1} in direction ({normal}), {{}} from the base"
+        offset = self.length_mm * float(self.offset.detach())
+        share = 100 * float(self.share.detach())
+        return [
+            Reading(place, offset, "mm", signed=offset < 0.0),
+            Reading("it pushes {} of the depth back", share, "%", most=MOST_PERCENT),
         ]
 
 

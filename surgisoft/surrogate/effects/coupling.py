@@ -24,6 +24,7 @@ from surgisoft.surrogate.effects.base import (
     value_of,
 )
 from surgisoft.surrogate.effects.hypothesis import Hypothesis, no_combinations
+from surgisoft.surrogate.effects.readings import Reading
 
 WHO = ("all", "next", "previous")
 """Chambers that may reduce the push of one chamber in proportion to it."""
@@ -100,6 +101,28 @@ class Coupling(Memoryless):
             Quantity("linear_share", value_of(self.linear), "", -0.3, 0.5, wall),
             Quantity(f"{self._second}_share", value_of(second), "", -0.3, 0.5, wall),
             Quantity("total_share", total, "", 0.0, 0.5, "neighbours take push and give none"),
+        ]
+
+    def readings(self, seconds: float | None = None) -> list[Reading]:
+        """Push that a chamber loses to another one where both are fully loaded, %."""
+        linear = float(self.linear.detach())
+        second = getattr(self, self._second).detach().tolist()
+        both = [linear + one for one in second]
+        chambers = range(1, len(self.facts.low) + 1)
+        if self.pairs:
+            pairs = [(i, j) for i in chambers for j in chambers if i != j]
+            texts = [f"chamber {i} loses {{}} of its push to chamber {j}" for i, j in pairs]
+        elif self.who in ("next", "previous"):
+            texts = [
+                f"each chamber loses {{}} of its push to the {self.who} one",
+                "{} to every other one",
+            ]
+            both.append(linear)
+        else:
+            texts = ["each chamber loses {} of its push to every other one"]
+        return [
+            Reading(text, 100 * share, "%", share, signed=True)
+            for text, share in zip(texts, both, strict=True)
         ]
 
 

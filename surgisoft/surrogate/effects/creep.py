@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from surgisoft.surrogate.effects.base import (
+    TEN_MINUTES,
     ArmFacts,
     Context,
     Effect,
@@ -24,10 +25,13 @@ from surgisoft.surrogate.effects.base import (
     value_of,
 )
 from surgisoft.surrogate.effects.hypothesis import Hypothesis
+from surgisoft.surrogate.effects.readings import Reading, duration
 from surgisoft.surrogate.scan import linear_scan
 
 TIMES = torch.logspace(-0.45, 2.55, 11, dtype=torch.float64)
 """(K,) retardation times, 0.35 to 350 s, a factor of 2 apart."""
+HALVINGS = 30
+"""Halvings in the search for the time after which half of the creep has come."""
 SMALL = 1e-3
 """Load below which the power law is smoothed to a straight line."""
 GRID = (
@@ -135,6 +139,25 @@ class Creep(Effect):
                 3.0,
                 "wide: 1 is a linear solid (Findley 1976, ch. 5)",
             ),
+        ]
+
+    def readings(self, seconds: float | None = None) -> list[Reading]:
+        """Creep under a load that is held as long as the recordings last (%), and its half (s)."""
+        held = seconds or TEN_MINUTES
+        times, spectrum = self.times.double(), self.spectrum.detach().double()
+
+        def crept(after: float) -> float:
+            return float(-spectrum @ torch.expm1(-after / times))
+
+        low, high = 0.0, held
+        for _ in range(HALVINGS):
+            middle = (low + high) / 2
+            low, high = (low, middle) if 2 * crept(middle) > crept(held) else (middle, high)
+        grown = 100 * float(self.amount.detach()) * crept(held)
+        text = f"push under a full load held for {duration(held)} {{+}}"
+        return [
+            Reading(text, grown, "%", signed=True),
+            Reading("half of the creep comes within {}", high, "s"),
         ]
 
 

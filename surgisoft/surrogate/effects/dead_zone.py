@@ -22,6 +22,7 @@ from surgisoft.surrogate.effects.base import (
     value_of,
 )
 from surgisoft.surrogate.effects.hypothesis import Hypothesis
+from surgisoft.surrogate.effects.readings import Reading, each_chamber
 
 GRID = (0.04, 0.1, 0.25)
 """Widths that identification tries, loads."""
@@ -70,6 +71,17 @@ class DeadZone(Memoryless):
             Quantity(f"threshold_{unit}", threshold, unit, 0.0, 0.5 * full, folds),
             Quantity(f"width_{unit}", width, unit, 0.002 * full, full, folds),
         ]
+
+    def readings(self, seconds: float | None = None) -> list[Reading]:
+        """Push that is lost, in the arm's unit."""
+        lost, unit = self.threshold.detach(), self.facts.unit
+        sizes = lost.tolist()
+        if self.each:
+            text = "chamber {chamber} loses {} of its push"
+            return each_chamber(text, (self.reach * lost).tolist(), unit, sizes)
+        full = float(self.reach.mean())
+        text = "each chamber loses {} of its push"
+        return [Reading(text, full * sizes[0], unit, sizes[0], signed=True)]
 
 
 def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:

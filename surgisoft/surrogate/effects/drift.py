@@ -20,11 +20,14 @@ Elapsed time comes from the recording where it is stated, and is the sum of the 
 simulated world; a temperature that is not known counts as T_0.
 """
 
+import math
+
 import torch
 from torch import Tensor, nn
 
 from surgisoft.errors import unknown_name
 from surgisoft.surrogate.effects.base import (
+    TEN_MINUTES,
     ArmFacts,
     Context,
     Effect,
@@ -35,15 +38,18 @@ from surgisoft.surrogate.effects.base import (
     value_of,
 )
 from surgisoft.surrogate.effects.hypothesis import Hypothesis, no_combinations
+from surgisoft.surrogate.effects.readings import Reading, duration, each_axis, each_chamber
 from surgisoft.surrogate.effects.rotation import rotate
 
 KINDS = ("base", "actuation", "temperature")
-TEN_MINUTES = 600.0
-"""Time at which the amplitudes are given, s."""
 ROOM_C = 22.0
 """T_0 where the recordings do not state it, degrees Celsius."""
 TEN_KELVIN = 10.0
 """Change of temperature at which the amplitudes are given, K."""
+TINY = 1e-9
+"""Growth below which an exponential is its first term."""
+MOST_LOG = 10.0
+"""Logarithm of a time over tau from which the drift has ended."""
 GRID = (200.0, 1000.0, 20000.0)
 """Times tau of the base that identification tries, s."""
 FEW = (1000.0, 20000.0)
@@ -191,6 +197,45 @@ class Drift(Effect):
             Quantity("gain_in_10_K_share", value_of(self.gain), "", -0.4, 0.4, rubber),
             Quantity("offset_in_10_K_share", value_of(self.offset), "", -0.3, 0.3, rubber),
         ]
+
+    def _grown_in(self, seconds: float) -> float:
+        """`grown` in double precision, also where tau is beyond all bounds."""
+        power = 1.0 if self.log_power is None else float(self.log_power.detach().exp())
+        tau = float(self.log_tau.detach())
+        now, later = (
+            math.exp(min(power * (math.log(t) - tau), MOST_LOG)) for t in (seconds, TEN_MINUTES)
+        )
+        if later < TINY:
+            return (seconds / TEN_MINUTES) ** power
+        return math.expm1(-now) / math.expm1(-later)
+
+    def readings(self, seconds: float | None = None) -> list[Reading]:
+        """Change over the recordings' time, or in 10 K: of the base (degrees, mm), or of gain (%)
+        and offset (in the arm's unit) of each chamber."""
+        span = seconds or TEN_MINUTES
+        if self.kind == "temperature":
+            grown, when = 1.0, f"in {TEN_KELVIN:.0f} K"
+        else:
+            grown = self._grown_in(span)
+            when = f"in {duration(span)}"
+        if self.kind == "base":
+            turn, shift = grown * self.turn.detach(), (grown * self.shift.detach()).tolist()
+            length = self.facts.length_mm or float(self.facts.rest_mm.norm(dim=-1).max()) or 1.0
+            angles, moved = torch.rad2deg(turn).tolist(), (length * turn).tolist()
+            return [
+                *each_axis(f"base turned by {{+}} about {{axis}} {when}", angles, "degrees", moved),
+                *each_axis(f"base shifted by {{+}} along {{axis}} {when}", shift, "mm", shift),
+            ]
+        gain, offset = grown * self.gain.detach(), grown * self.offset.detach()
+        percent = (100 * gain).tolist()
+        text = f"gain of chamber {{chamber}} {{+}} {when}"
+        if self.kind == "temperature":
+            gains = [Reading(f"gain {{+}} {when}", percent[0], "%", float(gain), signed=True)]
+        else:
+            gains = each_chamber(text, percent, "%", gain.tolist())
+        offsets, unit = (self.reach * offset).tolist(), self.facts.unit
+        text = f"offset of chamber {{chamber}} {{+}} {when}"
+        return [*gains, *each_chamber(text, offsets, unit, offset.tolist())]
 
 
 def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from surgisoft.surrogate.effects.base import ArmFacts, Memoryless, Quantity, amplitude
 from surgisoft.surrogate.effects.hypothesis import Hypothesis
+from surgisoft.surrogate.effects.readings import Reading, each_chamber
 
 
 class GainMismatch(Memoryless):
@@ -41,6 +42,11 @@ class GainMismatch(Memoryless):
         """Relative gain errors, by chamber."""
         cast = "wide: half to one and a half times the nominal push"
         return [Quantity("gain_share", self.gain.detach().tolist(), "", -0.5, 0.5, cast)]
+
+    def readings(self, seconds: float | None = None) -> list[Reading]:
+        """Change of each chamber's push, %."""
+        gains = self.gain.detach().tolist()
+        return each_chamber("push of chamber {chamber} {+}", [100 * g for g in gains], "%", gains)
 
 
 HYPOTHESIS = Hypothesis(GainMismatch, measured_body="gain", by_definition=True)

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from surgisoft.surrogate.arm import centre_and_half
 from surgisoft.surrogate.effects.base import ArmFacts, Context, Effect, Quantity, value_of
 from surgisoft.surrogate.effects.hypothesis import Hypothesis
+from surgisoft.surrogate.effects.readings import Reading
 from surgisoft.surrogate.effects.wall_fibres import RINGS, fibre_matrix
 from surgisoft.surrogate.scan import play_scan
 
@@ -187,6 +188,20 @@ class Hysteresis(Effect):
             Quantity("line_share", value_of(self.linear), "", -3.0, 3.0, "a mixture of shares"),
             Quantity("radius_share", list(self.radii), "", 0.0, 1.0, "Krasnosel'skii 1989, ch. 1"),
         ]
+
+    def readings(self, seconds: float | None = None) -> list[Reading]:
+        """Width of the loop of one chamber over its whole range, in the arm's unit."""
+        unit, full = self.facts.unit, torch.diag(self.facts.high - self.facts.low)
+        low, middle = self.facts.low.expand(full.shape), self.facts.low + 0.5 * full
+        high = self.facts.low + full
+        context = Context(dt_s=full.new_ones(len(full)))
+        with torch.no_grad():
+            memory = self.advance(self.rest(high), low, context)
+            rising = self.advance(memory, middle, context)
+            falling = self.advance(self.advance(rising, high, context), middle, context)
+            wide = self.apply(middle, falling) - self.apply(middle, rising)
+        text = "loop of {} between loading and unloading, at half load of one chamber"
+        return [Reading(text, float(wide.diagonal().mean()), unit, signed=True)]
 
 
 def turns(chambers: int, lines: int) -> Tensor:

@@ -27,6 +27,7 @@ from surgisoft.surrogate.effects.base import (
     value_of,
 )
 from surgisoft.surrogate.effects.hypothesis import Hypothesis
+from surgisoft.surrogate.effects.readings import MOST_PERCENT, Reading
 from surgisoft.surrogate.scan import linear_scan
 
 GRID = (
@@ -139,6 +140,16 @@ class Inertia(Effect):
             Quantity("share", value_of(self.share), "", 0.0, 1.2, "1: all of the arm swings"),
             Quantity("frequency_Hz", value_of(self.log_frequency.exp()), "Hz", 0.1, 50.0, soft),
             Quantity("damping_ratio", damping, "", 0.005, 0.5, swings),
+        ]
+
+    def readings(self, seconds: float | None = None) -> list[Reading]:
+        """Frequency (Hz), damping ratio, and the share of the arm that swings (%)."""
+        damping = float(self.damping_logit.detach().sigmoid())
+        share = 100 * float(self.share.detach())
+        return [
+            Reading("swings at {}", float(self.log_frequency.detach().exp()), "Hz"),
+            Reading("damping ratio {}", damping, ""),
+            Reading("{} of the actuation swings", share, "%", most=MOST_PERCENT),
         ]
 
 

@@ -37,6 +37,7 @@ from surgisoft.surrogate.effects.base import (
     value_of,
 )
 from surgisoft.surrogate.effects.hypothesis import Hypothesis, no_combinations
+from surgisoft.surrogate.effects.readings import MOST_PERCENT, Reading
 from surgisoft.surrogate.scan import follow, linear_scan, stepped
 
 CHAIN = 3
@@ -192,6 +193,20 @@ class LineLag(Effect):
             Quantity("tau_down_s", value_of(self.log_down.exp()), "s", 0.005, 20.0, tube),
             Quantity("dead_s", value_of(self.log_dead.exp()), "s", 0.0, 2.0, tube),
             Quantity("turn", value_of(self.log_turn.exp()), "", 0.0, 1e4, both),
+        ]
+
+    def readings(self, seconds: float | None = None) -> list[Reading]:
+        """Time constants and dead time (s), and how much of the command they delay (%)."""
+        up, down, dead = (
+            float(p.detach().exp()) for p in (self.log_up, self.log_down, self.log_dead)
+        )
+        share = 100 * float(self.share.detach())
+        slowest = max(up, down)
+        return [
+            Reading("time constant of filling {}", up, "s", slowest),
+            Reading("time constant of emptying {}", down, "s", slowest),
+            Reading("dead time {}", dead, "s", dead),
+            Reading("{} of the command lags", share, "%", most=MOST_PERCENT),
         ]
 
 

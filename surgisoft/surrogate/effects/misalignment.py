@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from surgisoft.surrogate.effects.base import ArmFacts, Memoryless, Quantity, amplitude, value_of
 from surgisoft.surrogate.effects.hypothesis import Hypothesis
+from surgisoft.surrogate.effects.readings import Reading, each_axis
 from surgisoft.surrogate.effects.rotation import rotate
 
 
@@ -52,6 +53,18 @@ class Misalignment(Memoryless):
             Quantity("turn_rad", value_of(self.turn), "rad", -0.3, 0.3, setup),
             Quantity("shift_mm", value_of(self.shift), "mm", -20.0, 20.0, setup),
             Quantity("scale_share", value_of(self.scale), "", -0.1, 0.1, "a wand's calibration"),
+        ]
+
+    def readings(self, seconds: float | None = None) -> list[Reading]:
+        """Turn (degrees) and shift (mm) about and along each axis, and the scale (%)."""
+        turn, shift = self.turn.detach(), self.shift.detach().tolist()
+        scale = float(self.scale.detach())
+        length = self.facts.length_mm or float(self.facts.rest_mm.norm(dim=-1).max()) or 1.0
+        angles, moved = torch.rad2deg(turn).tolist(), (length * turn).tolist()
+        return [
+            *each_axis("frame turned by {+} about {axis}", angles, "degrees", moved),
+            *each_axis("shifted by {+} along {axis}", shift, "mm", shift),
+            Reading("scaled by {+}", 100 * scale, "%", length * scale, signed=True),
         ]
 
 

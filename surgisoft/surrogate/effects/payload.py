@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from surgisoft.surrogate.effects.base import ArmFacts, Memoryless, Quantity, amplitude, value_of
 from surgisoft.surrogate.effects.beam import Beam, cross, displaced
 from surgisoft.surrogate.effects.hypothesis import Hypothesis, no_combinations
+from surgisoft.surrogate.effects.readings import Reading, each_axis
 
 
 class Payload(Memoryless):
@@ -90,6 +91,17 @@ class Payload(Memoryless):
             Quantity("body_sag_mm", value_of(self.body_sag), "mm", least, largest, small),
             Quantity("sag_mm", value_of(total), "mm", lightest, largest, "no negative mass"),
         ]
+
+    def readings(self, seconds: float | None = None) -> list[Reading]:
+        """Sag of the tip, mm, of the arm held straight and level.
+
+        Grams would need the bending stiffness, which key points do not tell.
+        """
+        sag = (self.tip_sag + self.body_sag).detach().tolist()
+        if len(sag) == 1:
+            text = "weight that makes the straight, level arm sag by {} at the tip"
+            return [Reading(text, sag[0], "mm", signed=True)]
+        return each_axis("load along {axis} that bends the straight arm by {}", sag, "mm", sag)
 
 
 HYPOTHESIS = Hypothesis(

@@ -30,6 +30,7 @@ from surgisoft.surrogate.effects.base import (
     value_of,
 )
 from surgisoft.surrogate.effects.hypothesis import Hypothesis, no_combinations
+from surgisoft.surrogate.effects.readings import MOST_PERCENT, Reading
 from surgisoft.surrogate.effects.wall_fibres import WallFibres, fibres_tried
 from surgisoft.surrogate.scan import follow, stepped
 
@@ -125,6 +126,14 @@ class RateDependence(WallFibres):
             Quantity("tau_s", value_of(self.log_tau.exp()), "s", 0.005, 10.0, rubber),
             Quantity("turn", value_of(self.log_turn.exp()), "", 0.0, 1e4, both),
             *self.mixture(),
+        ]
+
+    def readings(self, seconds: float | None = None) -> list[Reading]:
+        """Time constant (s) and the share of the load that is held back at first (%)."""
+        share = 100 * float(self.share.detach())
+        return [
+            Reading("time constant {}", float(self.log_tau.detach().exp()), "s"),
+            Reading("{} of a change of load is held back at first", share, "%", most=MOST_PERCENT),
         ]
 
 

@@ -29,6 +29,7 @@ from surgisoft.surrogate.effects.base import (
     value_of,
 )
 from surgisoft.surrogate.effects.hypothesis import Hypothesis
+from surgisoft.surrogate.effects.readings import Reading
 from surgisoft.surrogate.effects.wall_fibres import WallFibres, bend_and_stretch, walls_tried
 
 GRID = ((0.05, 0.02), (0.2, 0.02), (0.8, 0.02), (0.02, 0.2), (0.02, 0.7))
@@ -134,6 +135,16 @@ class Softening(WallFibres):
             Quantity("growth_share", value_of(self.log_growth.exp()), "", 1e-4, 5.0, rubber),
         ]
         return [*quantities, *self.mixture()]
+
+    def readings(self, seconds: float | None = None) -> list[Reading]:
+        """Change of a chamber's push at half load after a full load, %."""
+        with torch.no_grad():
+            full = torch.diag(self.reach)
+            half = self.origin + 0.5 * full
+            after = self.apply(half, self.energy(self.origin + full)) - half
+            more = 100 * float((after / (0.5 * self.reach)).diagonal().mean())
+        text = "push of a chamber at half load after a full one {+}"
+        return [Reading(text, more, "%", signed=True)]
 
 
 def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:

@@ -32,6 +32,7 @@ from surgisoft.surrogate.effects.base import (
     value_of,
 )
 from surgisoft.surrogate.effects.hypothesis import Hypothesis
+from surgisoft.surrogate.effects.readings import Reading
 from surgisoft.surrogate.effects.wall_fibres import WallFibres, bend_and_stretch, walls_tried
 
 GRID = (0.1, 2.0, 5.0)
@@ -117,6 +118,24 @@ class Stiffening(WallFibres, Memoryless):
             Quantity("steepness", value_of(self.log_steepness.exp()), "", 0.005, 12.0, rubber),
         ]
         return [*quantities, *self.mixture()]
+
+    def readings(self, seconds: float | None = None) -> list[Reading]:
+        """Push that is lost at full load, of one chamber alone and of all chambers at once, %."""
+        with torch.no_grad():
+            full = torch.diag(self.reach)
+            full = torch.cat([full, self.reach.unsqueeze(0)])
+            bent = self.apply(self.origin + full, full.new_zeros(len(full), 0)) - self.origin
+            lost = 100 * (1 - bent / self.reach)
+        alone, together = float(lost[:-1].diagonal().mean()), float(lost[-1].mean())
+        texts = (
+            "at full load one chamber alone loses {} of its push",
+            "all chambers at once lose {}",
+        )
+        values = (alone, together) if len(full) > 2 else (alone,)
+        return [
+            Reading(text, value, "%", value, signed=True)
+            for text, value in zip(texts, values, strict=False)
+        ]
 
 
 def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:

@@ -17,6 +17,8 @@ shape r_0 at rest times the share `hanging` of it that weight has bent, is missi
     q = p + int theta x dr - hanging int theta_0 x dr_0,      theta_0 = (...) (r_0(s) - r_0(0)) / L.
 """
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -30,6 +32,7 @@ from surgisoft.surrogate.effects.base import (
 )
 from surgisoft.surrogate.effects.beam import Beam, displaced
 from surgisoft.surrogate.effects.hypothesis import Hypothesis, no_combinations
+from surgisoft.surrogate.effects.readings import Reading
 
 LEAST_BENT = 0.01
 """Displacement of a key point of the arm at rest by a twist of 1 rad, as a share of its length,
@@ -117,6 +120,12 @@ class Twist(Effect):
             return twist
         bent = "0: bent as cast, 1: bent by weight; beyond 1 as cast against its weight"
         return [*twist, Quantity("hanging_share", value_of(self.hanging), "", 0.0, 1.5, bent)]
+
+    def readings(self, seconds: float | None = None) -> list[Reading]:
+        """Twist of the tip at full load of all chambers, degrees."""
+        angle = math.degrees(float((self.linear + self.quadratic).detach()))
+        text = "the tip turns by {+} about the arm at full load of all chambers"
+        return [Reading(text, angle, "degrees", signed=True)]
 
 
 def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:

@@ -1,0 +1,209 @@
+"""What effects say of their parameters, against what they do to a signal."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from surgisoft.surrogate.effects import Context, Reading, in_words, make_effect
+from tests.surrogate.effects.arms import FACTS, REST_MM, stir, variants
+
+EFFECTS = variants()
+NONE = torch.zeros(1, 0)
+
+
+def with_amplitudes(effect, **values):
+    """The effect with amplitudes set by name."""
+    for name, value in values.items():
+        effect.amplitudes()[name].data.copy_(torch.as_tensor(value))
+    return effect
+
+
+def values(effect, seconds=None):
+    """Value of each reading by its words."""
+    return {each.text: each.value for each in effect.readings(seconds)}
+
+
+def loaded(*loads):
+    """(1, 3) actuation of loads, 1 at full."""
+    return (FACTS.high * torch.tensor(loads)).unsqueeze(0)
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_every_effect_says_what_its_parameters_mean(name):
+    """As many readings whatever the parameters are, and finite ones."""
+    effect = EFFECTS[name]
+    first = effect.readings(600.0)
+    assert first
+    moved = stir(make_effect(name.split("-")[0], FACTS, **effect.config()))
+    for seconds in (None, 40.0, 600.0, 1e6):
+        readings = moved.readings(seconds)
+        assert len(readings) == len(first)
+        assert all(math.isfinite(each.value) for each in readings)
+        assert all(("{}" in each.text) != ("{+}" in each.text) for each in readings)
+        assert "{" not in in_words(readings)
+
+
+def test_a_gain_is_the_push_that_a_chamber_has_more():
+    effect = with_amplitudes(make_effect("gain_mismatch", FACTS), gain=[0.1, -0.08, 0.0])
+    pushed = effect.apply(loaded(1, 1, 1), NONE) / FACTS.high - 1
+    said = list(values(effect).values())
+    assert said == pytest.approx((100 * pushed)[0].tolist(), abs=1e-4)
+    assert in_words(effect.readings()) == "push of chamber 1 +10 %, push of chamber 2 -8 %"
+
+
+@pytest.mark.parametrize("config", [{"pairs": True}, {"who": "next"}, {"who": "previous"}, {}])
+def test_a_coupling_says_which_chamber_loses_to_which(config):
+    """By the effect itself, with one chamber fully loaded, and with two."""
+    effect = stir(make_effect("coupling", FACTS, **config), seed=1)
+    after = {"next": 1, "previous": -1}
+    for text, value in values(effect).items():
+        numbers = [int(word) for word in text.split() if word.isdigit()]
+        if numbers:
+            own, other = (number - 1 for number in numbers)
+        elif config.get("who", "none") in text:
+            own, other = 0, after[config["who"]] % 3
+        else:
+            own, other = 0, -after.get(config.get("who"), 1) % 3
+        loads = [0.0, 0.0, 0.0]
+        loads[own] = loads[other] = 1.0
+        lost = 1 - effect.apply(loaded(*loads), NONE)[0, own] / FACTS.high[own]
+        assert value == pytest.approx(100 * float(lost.detach()), abs=1e-3)
+
+
+def test_a_dead_zone_says_the_push_that_is_lost_far_from_rest():
+    effect = with_amplitudes(
+        make_effect("dead_zone", FACTS, width=0.001, each=True), threshold=[0.1, 0.0, 0.04]
+    )
+    lost = (loaded(1, 1, 1) - effect.apply(loaded(1, 1, 1), NONE))[0]
+    assert list(values(effect).values()) == pytest.approx(lost.tolist(), rel=1e-3)
+    words = "chamber 1 loses 5 kPa of its push, chamber 3 loses 2 kPa of its push"
+    assert in_words(effect.readings()) == words
+
+
+@pytest.mark.parametrize("kind", ["base", "actuation", "temperature"])
+def test_a_drift_says_of_what_and_how_much_over_the_recording(kind):
+    effect = make_effect("drift", FACTS, kind=kind, tau_s=400.0)
+    after = torch.tensor([[10.0 if kind == "temperature" else 300.0]])
+    if kind == "base":
+        with_amplitudes(effect, turn=[0.0, 0.0, 0.1], shift=[0.0, -2.0, 0.0])
+        at = torch.tensor([[[10.0, 0.0, 0.0]]])
+        moved = effect.apply(at, after)[0, 0]
+        said = values(effect, 300.0)
+        turned = math.degrees(math.atan2(float(moved[1] - said_of(said, "along y")), moved[0]))
+        assert said_of(said, "about z") == pytest.approx(turned, rel=1e-3)
+        zero = effect.apply(torch.zeros(1, 1, 3), after)[0, 0]
+        assert said_of(said, "along y") == pytest.approx(float(zero[1]), rel=1e-5)
+        assert "in 300 s" in in_words(effect.readings(300.0))
+        return
+    chambers = 1 if kind == "temperature" else 3
+    gain = [0.0, -0.3, 0.0][:chambers] if chambers > 1 else [-0.3]
+    with_amplitudes(effect, gain=gain, offset=[0.0, 0.0, 0.1])
+    change = (effect.apply(loaded(1, 1, 0), after) - loaded(1, 1, 0))[0]
+    said = values(effect, 300.0)
+    one = "gain {+}" if chambers == 1 else "gain of chamber 2"
+    assert said_of(said, one) == pytest.approx(100 * float(change[1] / FACTS.high[1]), rel=1e-4)
+    assert said_of(said, "offset of chamber 3") == pytest.approx(float(change[2]), rel=1e-4)
+    assert "chamber 1" not in in_words(effect.readings(300.0))
+
+
+def said_of(said, words):
+    """The value of the reading with these words."""
+    return next(value for text, value in said.items() if words in text)
+
+
+def test_a_drift_of_hours_is_steady_however_long_its_time_constant():
+    """Intervals draw time constants beyond all bounds."""
+    effect = with_amplitudes(make_effect("drift", FACTS, power=0.5), turn=[0.1, 0.0, 0.0])
+    for log_tau, share in ((80.0, 0.5), (4000.0, 0.5), (-4000.0, 1.0)):
+        effect.log_tau.data.fill_(log_tau)
+        said = said_of(values(effect, 150.0), "about x")
+        assert said == pytest.approx(math.degrees(0.1 * share), rel=1e-3)
+
+
+def test_creep_says_what_a_held_load_adds_and_when_half_of_it_has_come():
+    effect = with_amplitudes(make_effect("creep", FACTS, tau_s=200.0, width=0.2), amount=0.3)
+
+    def grown(seconds):
+        memory = effect.rest(torch.zeros(1, 3))
+        memory = effect.advance(memory, loaded(1, 0, 0), Context(torch.tensor([seconds])))
+        return float(effect.apply(loaded(1, 0, 0), memory)[0, 0] / FACTS.high[0] - 1)
+
+    more, half = values(effect, 300.0).values()
+    assert more == pytest.approx(100 * grown(300.0), rel=1e-4)
+    assert 2 * grown(half) == pytest.approx(grown(300.0), rel=1e-3)
+
+
+def test_a_wall_that_stiffens_or_softens_says_how_much_push_goes_or_comes():
+    """A cubic spring takes its share at full load; Mullins' damage of chamber 1 at half load."""
+    stiff = make_effect("stiffening", replace(FACTS, low=0 * FACTS.low), steepness=1e-3)
+    alone, together = values(with_amplitudes(stiff, own=0.2, bend=0.05)).values()
+    assert (alone, together) == pytest.approx((25.0, 20.0), abs=0.05)
+    soft = make_effect("softening", FACTS, width=0.2, growth=1e-6)
+    (more,) = values(with_amplitudes(soft, own=0.1, common=0.0)).values()
+    assert more == pytest.approx(100 * 0.1 * -math.expm1(-0.75 / 0.2), rel=1e-3)
+
+
+def test_hysteresis_says_the_width_of_its_loop():
+    """A play operator of radius r and weight w on each chamber's line: the loop is 2 w r wide."""
+    effect = make_effect("hysteresis", FACTS, radii=(0.2,), pairs=False)
+    for chamber in range(3):
+        effect.weight.data[chamber, chamber, 0] = 0.5
+    half = float((FACTS.high - FACTS.low).mean()) / 2
+    (wide,) = values(effect).values()
+    assert wide == pytest.approx(2 * 0.5 * 0.2 * half, rel=1e-4)
+
+
+def test_twist_payload_and_misalignment_say_angles_and_millimetres():
+    twist = with_amplitudes(make_effect("twist", FACTS), linear=0.2, quadratic=0.1)
+    assert list(values(twist).values()) == pytest.approx([math.degrees(0.3)], rel=1e-5)
+    level = replace(FACTS, gravity=(1.0, 0.0, 0.0))
+    payload = with_amplitudes(make_effect("payload", level), tip_sag=2.0, body_sag=1.0)
+    sunk = float(payload.apply(REST_MM.unsqueeze(0), NONE)[0, -1, 0])
+    assert list(values(payload).values()) == pytest.approx([sunk], rel=0.02)
+    frame = make_effect("misalignment", FACTS)
+    with_amplitudes(frame, turn=[0.0, 0.05, 0.0], shift=[0.0, 0.0, 3.0], scale=0.0)
+    words = "frame turned by +2.9 degrees about y, shifted by +3 mm along z"
+    assert in_words(frame.readings()) == words
+
+
+def test_lags_say_their_time_constants_and_contact_its_place():
+    lag = make_effect("line_lag", FACTS, up_s=0.3, down_s=0.6)
+    words = (
+        "time constant of filling 0.3 s, time constant of emptying 0.6 s, 80 % of the command lags"
+    )
+    assert in_words(with_amplitudes(lag, share=0.8).readings()) == words
+    viscous = with_amplitudes(make_effect("rate_dependence", FACTS, tau_s=0.15), share=1.6)
+    assert in_words(viscous.readings()) == "time constant 0.15 s"  # 160 % of a load is no share
+    swing = with_amplitudes(
+        make_effect("inertia", FACTS, frequency_Hz=1.5, damping=0.25), share=1.0
+    )
+    assert in_words(swing.readings()).startswith("swings at 1.5 Hz, damping ratio 0.25, 100 %")
+    wall = with_amplitudes(make_effect("contact", FACTS, point=2, offset_mm=12.0), share=0.5)
+    place = "support of key point 3 in direction (1.00, 0.00, 0.00), 12 mm from the base"
+    assert in_words(wall.readings()) == f"{place}, it pushes 50 % of the depth back"
+
+
+def test_a_sentence_leaves_out_what_recordings_do_not_determine():
+    gain = Reading("gain {+}", -50.0, "%", size=0.5, signed=True)
+    small = Reading("offset {+}", 3.0, "kPa", size=0.1, signed=True)
+    tau = Reading("time constant {}", 12345.6, "s")
+    assert in_words([gain, small, tau]) == "gain -50 %, time constant 12000 s"
+    sure = [(-52.0, -48.2), (1.0, 5.0), (12000.0, 13000.0)]
+    assert in_words([gain, small, tau], sure) == (
+        "gain -50 % (95 %: -52 to -48.2), offset +3 kPa (95 %: +1 to +5), "
+        "time constant 12300 s (95 %: 12000 to 13000)"
+    )
+    assert in_words([gain, small, tau], [(-90.0, 1.0), (-1.0, 5.0), (1.0, 1e9)]) == ""
+    nan = math.nan
+    assert in_words([gain, tau], [(nan, nan), (nan, nan)]) == ""
+    held = [(-50.0, -50.0), (3.0, 3.0), (12345.6, 12345.6)]  # a fit without intervals
+    assert in_words([gain, small, tau], held) == "gain -50 %, time constant 12300 s"
+
+
+def test_an_effect_of_a_user_says_its_single_numbers():
+    effect = EFFECTS["twist"]
+    said = super(type(effect), effect).readings()
+    assert [each.text for each in said] == ["linear {}", "quadratic {}"]
+    assert [each.unit for each in said] == ["rad", "rad"]

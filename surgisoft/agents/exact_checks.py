@@ -21,7 +21,7 @@ import torch
 from surgisoft.agents.rollout import Instant
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
-from surgisoft.scene.batched import BatchedScene
+from surgisoft.scene.batched import BatchClearance, BatchedScene
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.rays import RayHit
@@ -76,6 +76,9 @@ difference between both engines near contact that `tests/scene/test_distance.py`
 batched geometry calls 5 mm or more is a lower bound, see `batched.EXACT_WITHIN_MM`."""
 BEAMS_TOGETHER = 256
 """Beams that wait for FCL and are checked together (a count): batches make closed forms cheaper."""
+MARGIN_MM = 1.0
+"""Clearance that is left, by what arms have moved since it was measured, where it is not measured
+again (mm): far more than the batched geometry errs by."""
 AUDIT_EVERY = 64
 """One in so many of the instants that need no FCL is given to it anyway, as an audit (a count)."""
 
@@ -139,6 +142,7 @@ class ExactChecks:
         if not around.geometry.compiled:
             bodies, stretch = around.geometry.bodies, around.geometry.stretch
             self._bounds = BatchedScene(bodies, self.radii, stretch=stretch)
+        self._last = LastClearance(self._bounds)
         self._notes: dict[int, _Notes] = defaultdict(_Notes)
         self._beams: dict[str, list[_Beam]] = defaultdict(list)
 
@@ -162,7 +166,7 @@ class ExactChecks:
         checkers = [self.checker] * len(rows)
         clear = np.zeros(len(rows), bool)
         if placement is None:
-            clear = out_of_contact(self._bounds, lines)
+            clear = self._last.out_of_contact(numbers, lines)
         else:
             checkers = [self.checker.moved(placement, row) for row in rows.tolist()]
         notes = [self._notes[number] for number in numbers.tolist()]
@@ -297,8 +301,72 @@ class ExactChecks:
 def out_of_contact(scene: BatchedScene, lines: Mapping[str, torch.Tensor]) -> np.ndarray:
     """(R,) bool: arms (R, K, 3) mm that FCL cannot find in contact, among bodies at rest."""
     found = scene.clearance(lines)
-    near = torch.cat((found.bodies_mm.flatten(1), found.arms_mm, found.self_mm), 1)
-    return (near.amin(1) >= SURE_FROM_MM).numpy()
+    return (torch.cat((_to_others(found), found.self_mm), 1).amin(1) >= SURE_FROM_MM).numpy()
+
+
+def _to_others(found: BatchClearance) -> torch.Tensor:
+    """(R, P) mm: clearances of arms to bodies and to each other."""
+    return torch.cat((found.bodies_mm.flatten(1), found.arms_mm), 1)
+
+
+class LastClearance:
+    """`out_of_contact` of episodes step by step, which measures only what may have become less.
+
+    No point of an arm is farther from where it was than the point of its centreline that has moved
+    most, so a clearance to bodies at rest falls by at most that, and one between two arms by twice
+    that. That of an arm to itself, which is between parts a length of arc apart, has no such bound.
+    """
+
+    def __init__(self, scene: BatchedScene):
+        """scene: the bodies at rest."""
+        self._scene = scene
+        self._mm = np.zeros(0)
+        self._lines: dict[str, np.ndarray] = {}
+
+    def out_of_contact(self, episodes: np.ndarray, lines: Mapping[str, torch.Tensor]) -> np.ndarray:
+        """(R,) bool for arms (R, K, 3) mm of episodes (R,), as the function says."""
+        arrays = {name: line.numpy() for name, line in lines.items()}
+        if self._bound(episodes, arrays):
+            own = self._scene.clearance_to_itself(lines)
+            return (own.amin(1) >= SURE_FROM_MM).numpy()
+        found = self._scene.clearance(lines)
+        others = _to_others(found).amin(1)
+        self._keep(episodes, others.double().numpy(), arrays)
+        return (torch.minimum(others, found.self_mm.amin(1)) >= SURE_FROM_MM).numpy()
+
+    def _bound(self, episodes: np.ndarray, arrays: dict[str, np.ndarray]) -> bool:
+        """Whether what was measured last keeps all arms away from bodies and from each other."""
+        if episodes.max() >= len(self._mm) or not self._fit(arrays):
+            return False
+        moved = np.zeros(len(episodes))
+        for name, line in arrays.items():
+            step = line - self._lines[name][episodes]
+            far = np.einsum("rkc,rkc->rk", step, step).max(1)
+            moved = np.maximum(moved, np.sqrt(far, dtype=float))
+        return bool(np.all(self._mm[episodes] - 2.0 * moved >= SURE_FROM_MM + MARGIN_MM))
+
+    def _fit(self, arrays: dict[str, np.ndarray]) -> bool:
+        """Whether centrelines have as many points as those that are kept."""
+        return all(
+            name in self._lines and self._lines[name].shape[1:] == line.shape[1:]
+            for name, line in arrays.items()
+        )
+
+    def _keep(self, episodes: np.ndarray, mm: np.ndarray, arrays: dict[str, np.ndarray]) -> None:
+        """Keep the clearances (R,) mm and centrelines of episodes."""
+        if not self._fit(arrays):
+            self._mm, self._lines = self._mm[:0], {}
+        size = max(int(episodes.max()) + 1, len(self._mm))
+        if size > len(self._mm):
+            more = size - len(self._mm)
+            self._mm = np.concatenate((self._mm, np.full(more, -np.inf)))
+            for name, line in arrays.items():
+                nothing = np.zeros((more, *line.shape[1:]), line.dtype)
+                kept = self._lines.get(name, nothing[:0])
+                self._lines[name] = np.concatenate((kept, nothing))
+        self._mm[episodes] = mm
+        for name, line in arrays.items():
+            self._lines[name][episodes] = line
 
 
 def has_obstacles(task: Task) -> bool:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Collection, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 
@@ -18,7 +19,6 @@ from surgisoft.agents.evaluate import (
     watched_by,
 )
 from surgisoft.agents.exact_checks import ExactChecks
-from surgisoft.agents.on_rig import RigConfig, at_benches, on_rig, real_benches
 from surgisoft.agents.policies import POLICIES, Policy, check_policy, open_policy
 from surgisoft.agents.rollout import BATCH, EpisodeRecorders, rollout
 from surgisoft.agents.run_folder import RunFolder
@@ -38,6 +38,9 @@ from surgisoft.tasks.registry import (
     task_names,
     with_fields,
 )
+
+if TYPE_CHECKING:
+    from surgisoft.agents.on_rig import RigConfig
 
 
 def task_config(
@@ -279,7 +282,11 @@ def evaluate(
     request = EvaluationRequest(names, task, **fields).under_rules()
     plain, config = request.resolved(on_warning)
     _warn_of_reach(plain, on_warning)
-    place = plain if request.rig is None else on_rig(plain, request.rig, on_warning=on_warning)
+    place = plain
+    if request.rig is not None:
+        from surgisoft.agents.on_rig import on_rig
+
+        place = on_rig(plain, request.rig, on_warning=on_warning)
     if request.rules is not None:
         plain, place = request.rules.over(plain), request.rules.over(place)
     return _evaluated(request, plain, place, config, progress)
@@ -316,7 +323,13 @@ def _evaluated(
     request: EvaluationRequest, plain: Task, place: Task, config: Any, progress: Progress
 ) -> Evaluations:
     """Roll out every policy of a request on a task that is placed in simulation or on rigs."""
-    measured, seed = tuple(real_benches(place)), request.seed or 0
+    measured: tuple[str, ...] = ()
+    benches: AbstractContextManager[object] = nullcontext()
+    if request.rig is not None:
+        from surgisoft.agents.on_rig import at_benches, real_benches
+
+        measured, benches = tuple(real_benches(place)), at_benches(place)
+    seed = request.seed or 0
     logs = {
         name: EpisodeRecorders(place, name, seed, request.place, only=0) for name in request.log
     }
@@ -325,7 +338,7 @@ def _evaluated(
     checks: list[ExactChecks | None] = []
     interrupted = False
     try:
-        with at_benches(place):
+        with benches:
             opening = open_policy if request.rules is None else request.rules.policy
             opened = {name: opening(name, place) for name in request.policies}
             if measured:

@@ -24,6 +24,9 @@ HOURS_FROM_S = 7200.0
 def progress(title: str) -> Iterator[Progress]:
     """Show a bar with the rate, the time left and the end; yields a function of
     (done, total, note)."""
+    from surgisoft.cli import work_begins
+
+    work_begins()
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as RichProgress

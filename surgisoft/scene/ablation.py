@@ -321,7 +321,7 @@ class AblationMap:
         beams = [t.contiguous().numpy() for t in (began, ended, direction, energy, ring)]
         kept = [t.numpy() for t in (dose, peak, band, area, joule)]
         samples = (patch.points_mm, patch.normals, patch.areas_mm2, self._zones, self._stations)
-        place = (grid.origin_mm, grid.cell_mm, grid.shape, grid.starts)
+        place = (grid.origin_mm, grid.cell_mm, grid.shape, grid.starts, grid.cubes)
         constants = (self.waist_mm, self._counted, samples, place)
 
         def deposit(part: slice) -> None:
@@ -425,7 +425,7 @@ class LoneDose:
             *(began, ended, middle, self._energy, state.ring.numpy().copy(), dose_map.waist_mm),
             dose_map._counted,
             (patch.points_mm, patch.normals, patch.areas_mm2, dose_map._zones, dose_map._stations),
-            (grid.origin_mm, grid.cell_mm, grid.shape, grid.starts),
+            (grid.origin_mm, grid.cell_mm, grid.shape, grid.starts, grid.cubes),
             *(dose, self._peak, band, self._zone_mm2, joule),
         )
         self._station_mm = float(dose_map._ring_mm[state.ring[0]] / patch.stations)
@@ -629,7 +629,7 @@ def _deposit(
 ):
     """Add each environment's sweep to the samples near its path; see `sweep_fluence`."""
     points, normals, areas, zones, stations = samples
-    origin, cell, shape, starts = place
+    origin, cell, shape, starts, cubes = place
     scale = math.sqrt(2.0) / waist
     low, high = np.empty(3, np.int64), np.empty(3, np.int64)
     for n in range(len(energy)):
@@ -645,6 +645,8 @@ def _deposit(
             far = max(began[n, i], ended[n, i]) + tall - origin[i]
             low[i] = max(0, math.floor(max(near / cell, -1.0)))
             high[i] = min(shape[i] - 1, math.floor(min(far / cell, 1e6)))
+        if low[2] > high[2]:
+            continue
         m0, m1, m2 = ended[n, 0] - began[n, 0], ended[n, 1] - began[n, 1], ended[n, 2] - began[n, 2]
         slip = m0 * d0 + m1 * d1 + m2 * d2
         m0, m1, m2 = m0 - slip * d0, m1 - slip * d1, m2 - slip * d2
@@ -655,10 +657,12 @@ def _deposit(
         strength = 2.0 * energy[n] / (math.pi * waist * waist)
         for ci in range(low[0], high[0] + 1):
             for cj in range(low[1], high[1] + 1):
-                for ck in range(low[2], high[2] + 1):
-                    cube = (ci * shape[1] + cj) * shape[2] + ck
-                    if starts[cube] == starts[cube + 1]:
-                        continue
+                row = (ci * shape[1] + cj) * shape[2]
+                # Only cubes that hold samples; nine of ten along the beam are empty.
+                first, end = starts[row + low[2]], starts[row + high[2] + 1]
+                while first < end:
+                    cube, begin = cubes[first], first
+                    ck, first = cube - row, starts[cube + 1]
                     x = origin[0] + (ci + 0.5) * cell - began[n, 0]
                     y = origin[1] + (cj + 0.5) * cell - began[n, 1]
                     z = origin[2] + (ck + 0.5) * cell - began[n, 2]
@@ -670,7 +674,7 @@ def _deposit(
                     z = z - depth * d2 - along * m2
                     if x * x + y * y + z * z > (reach + 0.87 * cell) ** 2:
                         continue
-                    for s in range(starts[cube], starts[cube + 1]):
+                    for s in range(begin, first):
                         cosine = -(d0 * normals[s, 0] + d1 * normals[s, 1] + d2 * normals[s, 2])
                         if cosine <= 0.0:
                             continue

@@ -164,10 +164,15 @@ class BatchedScene:
             self._apart(lines[i], lines[j], radii[i] + radii[j])
             for i, j in combinations(range(len(names)), 2)
         ]
-        own = [self._folded(line, radius) for line, radius in zip(lines, radii, strict=True)]
         nothing = torch.empty((count, 0), dtype=dtype, device=self.device)
         apart = torch.stack(pairs, 1).to(dtype) if pairs else nothing
-        return BatchClearance(bodies, apart, torch.stack(own, 1).to(dtype))
+        own = self.clearance_to_itself(dict(zip(names, lines, strict=True)))
+        return BatchClearance(bodies, apart, own.to(dtype))
+
+    def clearance_to_itself(self, arms: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """(B, A) mm: clearance of each arm (B, K, 3) mm to itself, as in `clearance`."""
+        own = [self._folded(_held(line), self.radius_mm(name)) for name, line in arms.items()]
+        return torch.stack(own, 1)
 
     def cast(
         self,

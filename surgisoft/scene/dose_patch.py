@@ -75,6 +75,8 @@ class Buckets:
     """Cubes along each axis."""
     starts: np.ndarray
     """(X Y Z + 1,) int64."""
+    cubes: np.ndarray
+    """(P,) int64: cube of each sample, rising."""
 
 
 def cut_patch(
@@ -453,8 +455,9 @@ def _fill_buckets(points: np.ndarray, cell: float) -> tuple[np.ndarray, Buckets]
     shape = (int(last[0]) + 1, int(last[1]) + 1, int(last[2]) + 1)
     flat = np.ravel_multi_index(tuple(index.T), shape)
     order = np.argsort(flat, kind="stable")
-    starts = np.searchsorted(flat[order], np.arange(int(np.prod(shape)) + 1))
-    return order, Buckets(origin, cell, shape, starts.astype(np.int64))
+    cubes = flat[order].astype(np.int64)
+    starts = np.searchsorted(cubes, np.arange(int(np.prod(shape)) + 1))
+    return order, Buckets(origin, cell, shape, starts.astype(np.int64), cubes)
 
 
 def samples_at(patch: DosePatch, points_mm: np.ndarray) -> np.ndarray:

@@ -9,7 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from surgisoft.agents.evaluate import evaluate
-from surgisoft.agents.exact_checks import Contact, ExactChecks, has_obstacles, out_of_contact
+from surgisoft.agents.exact_checks import (
+    Contact,
+    ExactChecks,
+    LastClearance,
+    has_obstacles,
+    out_of_contact,
+)
 from surgisoft.agents.policies import Random
 from surgisoft.agents.rollout import Instant
 from surgisoft.scene.capsules import ArmShape
@@ -138,6 +144,45 @@ def test_where_fcl_is_not_asked_it_does_not_differ(task, checker, seed, spread_m
     )
     assert np.array_equal(kind[sure], exact[0][sure])
     np.testing.assert_allclose(end[sure], exact[1][sure], rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("folds", [False, True])
+def test_what_a_clearance_bounds_is_not_measured_again(task, monkeypatch, folds):
+    """Every step has the answer of a measurement, of arms that go into the organ, or fold up."""
+    around, count, steps = task.world.scene, 3, 60
+    scene, rng = around.geometry, np.random.default_rng(0)
+    start = {
+        name: part.line_mm.clone()
+        for name, part in Episodes(task).seeded(0, count).world.arms.items()
+    }
+    towards = around.centre_mm - start["laser"][:, -1:]
+    along = torch.linspace(0.0, 150.0, start["laser"].shape[1])
+    last, measured, expected = LastClearance(scene), [], []
+    whole = type(scene).clearance
+    for step in range(steps):
+        share = step / steps * (0.8 + 0.2 * torch.arange(count)[:, None, None] / count)
+        lines = {name: line.clone() for name, line in start.items()}
+        lines["laser"] += share * towards
+        if folds:  # to a ring, away from everything
+            angle = (1e-3 + 2 * torch.pi / 150.0 * share[..., 0]) * along
+            ring = torch.stack((angle.sin(), 1.0 - angle.cos(), 0.0 * angle), -1)
+            lines["laser"] = 400.0 + ring * (along[-1] / angle[:, -1:, None])
+        lines["endoscope"] += 0.01 * torch.from_numpy(rng.normal(size=(count, 1, 3))).float()
+        rows = torch.tensor([0, 1, 2] if step % 7 else [2, 0])
+        given = {name: line[rows].contiguous() for name, line in lines.items()}
+        calls = []
+        monkeypatch.setattr(
+            type(scene), "clearance", lambda self, *a, c=calls: c.append(1) or whole(self, *a)
+        )
+        found = last.out_of_contact(5 + rows.numpy(), given)
+        monkeypatch.undo()
+        measured.append(bool(calls))
+        expected.append(out_of_contact(scene, given))
+        assert np.array_equal(found, expected[-1])
+    clear = np.concatenate(expected)
+    assert clear.any()
+    assert not clear.all()
+    assert 1 <= sum(measured) < steps / 2
 
 
 def test_a_beam_that_grazes_an_edge_or_an_arm_is_left_to_fcl(task, checker):

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from surgisoft.cli import NEW_OBJECTS
+
 BEGIN = """
 import atexit, sys, threading, time
 from surgisoft.cli import end_process
@@ -84,3 +86,32 @@ def test_output_that_cannot_be_written_is_reported_as_python_does():
         )
     assert done.returncode == 120
     assert "No space left on device" in done.stderr
+
+
+LOOKS = """
+import gc, sys
+from surgisoft import cli
+
+def run():
+    made = [[] for _ in range(100_000)]
+    given, kept = gc.get_threshold()[0], gc.get_freeze_count()
+    if sys.argv[1] == "work":
+        from surgisoft.cli.progress import progress
+        with progress("test"):
+            pass
+    else:
+        made += [[] for _ in range(800_000)]
+    now = gc.get_threshold()[0]
+    print(given > 2 * now, now, kept, gc.get_freeze_count() > 1000)
+    return 0
+
+cli.run = run
+cli.main()
+"""
+
+
+@pytest.mark.parametrize("begun", ["work", "many objects"])
+def test_cycles_of_objects_are_looked_for_once_work_begins(begun):
+    """Not while commands import; from the first progress on, or where many objects were made."""
+    done = subprocess.run([sys.executable, "-c", LOOKS, begun], capture_output=True, text=True)
+    assert done.stdout == f"True {NEW_OBJECTS} 0 True\n", done.stderr

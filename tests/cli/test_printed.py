@@ -267,7 +267,11 @@ def test_the_page_of_a_diagnosis_has_the_command_that_is_printed(
     found = Diagnosis(
         Verdict("identified", ("payload",), "payload is missing", 0.9),
         ErrorLevels(0.5, 0.1, 0.05),
-        (Ranked("payload", 0.9, 0.5, 0.5, 0.1, (0.1, 0.2), 0.01, 1.0, {"mass_g": 90.0}),),
+        (
+            Ranked(
+                "payload", 0.9, 0.5, 0.5, 0.1, (0.1, 0.2), 0.01, 1.0, {"sag_mm": 2.0}, "sag 2 mm"
+            ),
+        ),
         next_command="surgisoft amend {model} --effect payload --data {data}{before} -o NEW",
         change=change,
     )
@@ -282,6 +286,8 @@ def test_the_page_of_a_diagnosis_has_the_command_that_is_printed(
     assert out.endswith(f"next: {command}\n")
     words = re.sub(r"<[^>]*>", "", (page / "diagnosis.html").read_text())
     assert command in html.unescape(words)
+    assert "payload: sag 2 mm." in words
+    assert "payload, first estimate: sag 2 mm\n" in out
     end = " --before BEFORE -o NEW" if change else " -o NEW"
     assert found.command().endswith(f"--data RECORDINGS{end}")
 

@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,10 +29,12 @@ from surgisoft.diagnosis.estimation.least_squares import (
 from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.estimation.network_error import NetworkError
 from surgisoft.diagnosis.estimation.nuisance import Nuisance, kinds
+from surgisoft.diagnosis.pages.amendment import parameter_parts
 from surgisoft.diagnosis.residuals import problem_of
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.recordings import Recording
+from surgisoft.report import Text
 from surgisoft.surrogate.checkpoint import default_arm
 from surgisoft.surrogate.effects import make_effect
 from surgisoft.surrogate.model import ArmModel
@@ -365,3 +368,18 @@ def test_a_value_of_which_nothing_is_learned_is_said_to_be_not_identifiable(low,
     assert tau.interval_text.startswith("not identifiable from these recordings") is not known
     chambers = replace(tau, value=[90.0, 90.0], low=[low, 80.0], high=[high, 95.0])
     assert chambers.identifiable
+
+
+def test_a_page_has_words_and_former_values_of_parameters():
+    """The column of former values is there where the model had an effect of them."""
+    fresh = Parameter("creep", "tau_s", 90.0, 80.0, 95.0, "s", True, (0.1, 2000.0), "the library's")
+    had = replace(fresh, before=120.0)
+    result = SimpleNamespace(parameters=(fresh,), in_words={"creep": "half of it in 60 s"})
+    words, table = parameter_parts(result)
+    assert words == Text("creep: half of it in 60 s.")
+    assert "before" not in table.header
+    result = SimpleNamespace(parameters=(fresh, had), in_words={"creep": ""})
+    (table,) = parameter_parts(result)
+    place = table.header.index("before")
+    assert [row[place] for row in table.rows] == ["-", "120"]
+    assert {len(row) for row in table.rows} == {len(table.header)}

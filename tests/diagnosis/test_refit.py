@@ -320,7 +320,7 @@ def test_the_refit_decides_over_the_residuals(problem, found):
     fitted = found.of("line_lag")
     assert result.ranking[0].parameters == fitted.parameters
     assert result.in_words == (("line_lag", fitted.in_words),)
-    assert "time constant of filling" in fitted.in_words
+    assert "time constant of a rise" in fitted.in_words
 
 
 def test_command_and_python_say_the_same_and_amend_makes_the_error_fall(

@@ -201,7 +201,7 @@ class Hysteresis(Effect):
             falling = self.advance(self.advance(rising, high, context), middle, context)
             wide = self.apply(middle, falling) - self.apply(middle, rising)
         text = "loop of {} between loading and unloading, at half load of one chamber"
-        return [Reading(text, float(wide.diagonal().mean()), unit, signed=True)]
+        return [Reading(text, float(wide.diagonal().mean()), unit)]
 
 
 def turns(chambers: int, lines: int) -> Tensor:

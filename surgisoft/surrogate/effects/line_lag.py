@@ -203,8 +203,8 @@ class LineLag(Effect):
         share = 100 * float(self.share.detach())
         slowest = max(up, down)
         return [
-            Reading("time constant of filling {}", up, "s", slowest),
-            Reading("time constant of emptying {}", down, "s", slowest),
+            Reading("time constant of a rise {}", up, "s", slowest),
+            Reading("time constant of a fall {}", down, "s", slowest),
             Reading("dead time {}", dead, "s", dead),
             Reading("{} of the command lags", share, "%", most=MOST_PERCENT),
         ]

@@ -35,13 +35,14 @@ class Reading:
     """How large it is beside the effect's other readings that have a size, in any unit common to
     them: a small one is not told. None: told whatever the others are."""
     signed: bool = False
-    """Whether zero means that there is nothing: the value may be negative."""
+    """Whether zero means that there is nothing and the value may be negative; else a negative value
+    makes no sense and is not told."""
     most: float = math.inf
     """Largest value that makes sense; a larger one is not told."""
 
     def known(self, ends: tuple[float, float] | None) -> bool:
         """Whether its 95 % interval determines the value; true where none is at hand."""
-        if not self.value <= self.most:
+        if not self.value <= self.most or (self.value < 0.0 and not self.signed):
             return False
         if ends is None or ends[0] == ends[1]:
             return True

@@ -153,6 +153,9 @@ def test_hysteresis_says_the_width_of_its_loop():
     half = float((FACTS.high - FACTS.low).mean()) / 2
     (wide,) = values(effect).values()
     assert wide == pytest.approx(2 * 0.5 * 0.2 * half, rel=1e-4)
+    assert in_words(effect.readings()).startswith("loop of 5.3 kPa between loading and unloading")
+    effect.weight.data.mul_(-1.0)  # a lead is no loop
+    assert in_words(effect.readings()) == ""
 
 
 def test_twist_payload_and_misalignment_say_angles_and_millimetres():
@@ -170,9 +173,7 @@ def test_twist_payload_and_misalignment_say_angles_and_millimetres():
 
 def test_lags_say_their_time_constants_and_contact_its_place():
     lag = make_effect("line_lag", FACTS, up_s=0.3, down_s=0.6)
-    words = (
-        "time constant of filling 0.3 s, time constant of emptying 0.6 s, 80 % of the command lags"
-    )
+    words = "time constant of a rise 0.3 s, time constant of a fall 0.6 s, 80 % of the command lags"
     assert in_words(with_amplitudes(lag, share=0.8).readings()) == words
     viscous = with_amplitudes(make_effect("rate_dependence", FACTS, tau_s=0.15), share=1.6)
     assert in_words(viscous.readings()) == "time constant 0.15 s"  # 160 % of a load is no share

@@ -18,9 +18,10 @@ from torch import Tensor, nn
 from surgisoft.errors import InputError
 from surgisoft.numpy_code import HELPERS, Constants, numpy_function
 from surgisoft.surrogate.callables import arm_runner, portable
+from surgisoft.surrogate.callables.called import CALLED
 from surgisoft.surrogate.callables.named import raised_by
 from surgisoft.surrogate.callables.network import CallableNetwork
-from surgisoft.surrogate.callables.operators import CALLED, as_operators
+from surgisoft.surrogate.callables.operators import as_operators
 
 IMPORTED = "from surgisoft.surrogate.callables.portable import Called\n"
 """Line of the runner that the text of that module replaces."""

@@ -8,10 +8,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any
-from weakref import WeakValueDictionary
 
-CALLED: WeakValueDictionary[int, Any] = WeakValueDictionary()
-"""Networks of callables by the number that stands for each in a traced program."""
+from surgisoft.surrogate.callables.called import CALLED
+
 _NUMBERED: ContextVar[dict[int, int] | None] = ContextVar("operators", default=None)
 
 

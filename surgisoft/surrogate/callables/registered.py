@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from surgisoft.numpy_code import FOREIGN
-from surgisoft.surrogate.callables.operators import CALLED
+from surgisoft.surrogate.callables.called import CALLED
 
 
 @torch.library.custom_op("surgisoft::callable_points", mutates_args=())

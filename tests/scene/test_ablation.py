@@ -208,14 +208,15 @@ def test_depth_asks_for_more_than_the_surface(slab):
     assert deep.report(swept(deep, points, 0.05, 2 * power)).completion.item() == 1.0
 
 
+@pytest.mark.parametrize("tilt", [0.0, 5.0])
 @pytest.mark.parametrize("engine", ON_ACCELERATORS)
-def test_deposits_of_the_engines_agree(slab, engine):
+def test_deposits_of_the_engines_agree(slab, engine, tilt):
     ablation = AblationMap(slab, WAIST)
     rng = np.random.default_rng(0)
     count = 12
     place = lambda: torch.tensor(rng.uniform([-13, -13, 4.9], [13, 13, 5.1], (count, 3))).float()  # noqa: E731
     began, ended = place(), place()
-    aim = frames.normalise(torch.tensor(rng.normal([0, 0, -2.0], 0.5, (count, 3))).float())
+    aim = frames.normalise(torch.tensor(rng.normal([tilt, 0, -2.0], 0.5, (count, 3))).float())
     aim[0] = -aim[0]  # from below: the surface faces away
     energy = torch.tensor(rng.uniform(0.1, 1.0, count)).float()
     state = ablation.start(began, aim, torch.ones(count, dtype=torch.bool))

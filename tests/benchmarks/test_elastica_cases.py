@@ -65,8 +65,8 @@ def test_unknown_effects_of_every_kind_come_in_turn():
 def brief(monkeypatch):
     """Recordings of a few seconds."""
     for module, name in ((elastica_cases, "BEFORE_S"), (rig_cases, "AFTER_S")):
-        monkeypatch.setattr(module, name, dict.fromkeys(getattr(module, name), 4.0))
-    monkeypatch.setattr(rig_cases, "TRIED_S", 4.0)
+        monkeypatch.setattr(module, name, dict.fromkeys(getattr(module, name), 2.5))
+    monkeypatch.setattr(rig_cases, "TRIED_S", 2.5)
 
 
 def test_a_case_repeats_the_actuation_and_differs_by_its_effect(tmp_path, brief):

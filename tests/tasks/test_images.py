@@ -44,7 +44,7 @@ def burnt(task):
 
 def test_the_checkers_of_pettingzoo_and_gymnasium_accept_it(tmp_path, task):
     file = tmp_path / "images.toml"
-    file.write_text('[world.endoscope_images]\nimages = "depth, rgb"\nimage_pixels = 80\n')
+    file.write_text('[world.endoscope_images]\nimages = "depth, rgb"\nimage_pixels = 72\n')
     made = []
 
     def make():
@@ -56,8 +56,8 @@ def test_the_checkers_of_pettingzoo_and_gymnasium_accept_it(tmp_path, task):
     space = made[0].observation_space("laser")
     assert {name: box.shape for name, box in space.items()} == {
         "vector": (42,),
-        "rgb": (80, 80, 3),
-        "depth": (80, 80, 1),
+        "rgb": (72, 72, 3),
+        "depth": (72, 72, 1),
     }
     assert space["rgb"].dtype == np.uint8
     assert made[0].state().shape == made[0].state_space.shape

@@ -13,6 +13,8 @@ other, directly or through others, share a box with a red frame.
 import argparse
 import ast
 import sys
+import textwrap
+from collections.abc import Sequence
 from itertools import combinations, pairwise
 from pathlib import Path
 
@@ -44,6 +46,8 @@ GAP = (26, 54)
 """Space between boxes, horizontally and vertically, px."""
 LETTER = (9, 6)
 """Width of a letter of a part's name and of the line below it, px."""
+LINE = 15
+"""Height of each further line in a box, px."""
 MARGIN = 20
 """Space around the drawing, px."""
 
@@ -201,8 +205,9 @@ def drawing(folder: Path, modules: bool = False) -> str:
             middle[k, name] = (left + own / 2, MARGIN + (top - k) * (BOX[1] + GAP[1]))
             left += own + GAP[0]
     ground = MARGIN + (top + 1) * (BOX[1] + GAP[1])
-    height = ground if modules else ground + BOX[1] + MARGIN
-    ground_modules = sorted(p.stem for p in folder.glob("*.py") if p.stem[0] != "_")
+    ground_modules = ", ".join(sorted(p.stem for p in folder.glob("*.py") if p.stem[0] != "_"))
+    about_ground = textwrap.wrap(ground_modules, int((width - 4 * MARGIN) / LETTER[1]))
+    height = ground if modules else ground + _tall(about_ground) + MARGIN
     line = 'fill="none" stroke="#56697d" stroke-width="1.3"'
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" '
@@ -226,10 +231,11 @@ def drawing(folder: Path, modules: bool = False) -> str:
         if ">" not in name:
             own = own_width(name)
             frame = "#c0392b" if "," in name else "#56697d"
-            lines += _box(x - own / 2, y, own, name, about_part(name), "#e8f0f7", frame)
+            about = about_part(name)
+            lines += _box(x - own / 2, y, own, name, about, fill="#e8f0f7", frame=frame)
     if not modules:
-        about = ", ".join(ground_modules)
-        lines += _box(MARGIN, ground, width - 2 * MARGIN, "ground: every part may import it", about)
+        title, wide_box = "ground: every part may import it", width - 2 * MARGIN
+        lines += _box(MARGIN, ground, wide_box, title, *about_ground)
     return "\n".join([*lines, "</svg>", ""])
 
 
@@ -238,19 +244,28 @@ def _box(
     y: float,
     width: float,
     name: str,
-    about: str,
+    *about: str,
     fill: str = "#f4f4ef",
     frame: str = "#56697d",
 ) -> list[str]:
+    """A box with a name and lines below it."""
     middle = x + width / 2
     return [
-        f'<rect x="{x:g}" y="{y:g}" width="{width:g}" height="{BOX[1]}" rx="5" fill="{fill}" '
+        f'<rect x="{x:g}" y="{y:g}" width="{width:g}" height="{_tall(about):g}" rx="5" fill="{fill}" '
         f'stroke="{frame}"/>',
         f'<text x="{middle:g}" y="{y + 19:g}" text-anchor="middle" font-size="14" '
         f'font-weight="bold" fill="#1b2733">{name}</text>',
-        f'<text x="{middle:g}" y="{y + 36:g}" text-anchor="middle" font-size="11.5" '
-        f'fill="#44525f">{about}</text>',
+        *(
+            f'<text x="{middle:g}" y="{y + 36 + LINE * k:g}" text-anchor="middle" '
+            f'font-size="11.5" fill="#44525f">{text}</text>'
+            for k, text in enumerate(about)
+        ),
     ]
+
+
+def _tall(about: Sequence[str]) -> float:
+    """Height of a box with these lines."""
+    return BOX[1] + LINE * max(0, len(about) - 1)
 
 
 if __name__ == "__main__":

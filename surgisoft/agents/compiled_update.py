@@ -1,7 +1,7 @@
 """PPO's update through `torch.compile`: the loss of a minibatch, forward and backward, as kernels.
 
-On a CPU inductor writes C++ for it. On CUDA it writes kernels that are recorded in CUDA graphs, so
-that a minibatch is a few launches in place of some two hundred.
+Inductor writes C++ for it. On a GPU the update is one CUDA graph (`graphed_update`), and the step
+of the arms is what is compiled.
 """
 
 from __future__ import annotations
@@ -51,18 +51,12 @@ def compiled_update(ppo: PPO) -> Callable[[], dict[str, float]]:
     The order of minibatches, the draws of random numbers and the rule of the learning rate are
     rsl-rl's; the sums of the kernels are added in another order, so that weights agree to rounding.
     """
-    device = torch.device(ppo.device)
-    check_compiler(device)
-    cuda = device.type == "cuda"
-    compiled = torch.compile(
-        PPOLoss(ppo), fullgraph=True, dynamic=False, mode="reduce-overhead" if cuda else None
-    )
+    check_compiler(torch.device(ppo.device))
+    compiled = torch.compile(PPOLoss(ppo), fullgraph=True, dynamic=False)
     built = False
 
     def losses(batch: Any) -> tuple[Tensor, ...]:
         nonlocal built
-        if cuda:
-            torch.compiler.cudagraph_mark_step_begin()
         mean, deviation = batch.old_distribution_params
         given = (batch.actions, batch.values, batch.advantages, batch.returns)
         seen = [
@@ -110,7 +104,7 @@ def _update(ppo: PPO, losses: Callable[[Any], tuple[Tensor, ...]]) -> dict[str, 
     for batch in storage.mini_batch_generator(batches, epochs):
         # rsl-rl draws actions here and leaves them: the stream of random numbers stays the same.
         torch.empty_like(batch.actions).normal_()
-        ppo.optimizer.zero_grad()  # before the loss: CUDA graphs write over former gradients
+        ppo.optimizer.zero_grad()
         loss, value, surrogate, chaos, apart = losses(batch)
         loss.backward()
         if isinstance(ppo, SharedPPO):

@@ -105,8 +105,9 @@ def make_ppo(env: JointEnv, preset: Preset, processes: Processes) -> dict[str, P
         ppo.storage.mini_batch_generator = functools.partial(gathered_once, each)
         if isinstance(ppo, SharedPPO):
             ppo.talk_once()
-        if torch.device(ppo.device).type == "cuda" and processes.count == 1:
-            ppo.update = GraphedUpdate(ppo)
+        if torch.device(ppo.device).type == "cuda":
+            if processes.count == 1:  # else gradients are exchanged in every minibatch
+                ppo.update = GraphedUpdate(ppo)
         elif preset.compile:
             ppo.update = compiled_update(ppo)
         ppo.train_mode()

@@ -171,6 +171,17 @@ def capsule_entry(origin: vec, d: vec, a: vec, b: vec, radius: real) -> real:
     return best
 
 
+@wp.func
+def near_capsule_entry(o: vec, d: vec, a: vec, b: vec, radius: real) -> real:
+    """`capsule_entry`, but inf at once where the ray misses the ball around the capsule."""
+    away = HALF * (a + b) - o
+    away = away - wp.max(ZERO, wp.dot(away, d)) * d
+    reach = radius + HALF * wp.length(b - a) + wp.float64(1e-9)
+    if wp.length_sq(away) > reach * reach:
+        return FAR
+    return capsule_entry(o, d, a, b, radius)
+
+
 # Walks through the tree of a body's faces.
 
 
@@ -590,14 +601,10 @@ def rays_to_arm(
         q = lines[b, k + 1]
         length = wp.length(q - p)
         if arc >= gap:
-            away = HALF * (p + q) - o
-            away = away - wp.max(ZERO, wp.dot(away, d)) * d
-            reach = radius + HALF * length + wp.float64(1e-9)
-            if wp.length_sq(away) <= reach * reach:
-                hit = capsule_entry(o, d, p, q, radius)
-                if hit < best or (found >= 0 and hit == best):  # the one nearest to the base
-                    best = hit
-                    found = k
+            hit = near_capsule_entry(o, d, p, q, radius)
+            if hit < best or (found >= 0 and hit == best):  # the one nearest to the base
+                best = hit
+                found = k
         arc = arc + length
     if found >= 0:
         t[n] = best
@@ -698,14 +705,9 @@ def hide_behind_arm(
         p = lines[b, k]
         q = lines[b, k + 1]
         length = wp.length(q - p)
-        if arc >= gap:
-            away = HALF * (p + q) - o
-            away = away - wp.max(ZERO, wp.dot(away, d)) * d
-            reach = radius + HALF * length + wp.float64(1e-9)
-            if wp.length_sq(away) <= reach * reach:
-                if capsule_entry(o, d, p, q, radius) < limit:
-                    clear[b, m] = False
-                    return
+        if arc >= gap and near_capsule_entry(o, d, p, q, radius) < limit:
+            clear[b, m] = False
+            return
         arc = arc + length
 
 

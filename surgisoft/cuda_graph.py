@@ -64,7 +64,7 @@ def recorded(
         found = record(work)
     except RuntimeError as error:
         warnings.warn(
-            f"no CUDA graph of {what}, its operations start one by one: {reason_of(error)}",
+            f"no CUDA graph could be made of {what}, which is slower without: {reason_of(error)}",
             AssumptionWarning,
             stacklevel=2,
         )

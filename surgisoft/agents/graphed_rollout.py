@@ -65,7 +65,7 @@ class GraphedRollout:
             self._step = self._done("step", self._stepped)
             self._done(f"storage {k}", functools.partial(self._stored, k))
             env.state = self._episodes.reset(env.state, self._step[1])
-            self._done("observe", self._observed)
+            self._done("observation", self._observed)
         means = self._done("returns", self._ended).tolist()
         rows = self.steps * env.num_envs
         return self._seen.clone(), RolloutMeans.of(
@@ -114,7 +114,7 @@ class GraphedRollout:
                 restore_state()
                 overwrite(self._seen.to_dict(), before.to_dict())
 
-            what, device = f"a rollout's {name}", self.env.task.world.device
+            what, device = f"the {name} of a rollout", self.env.task.world.device
             self._work[name] = recorded(work, restore, device, self._record, what)
         return self._work[name]()
 

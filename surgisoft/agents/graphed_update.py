@@ -92,7 +92,7 @@ class GraphedUpdate:
                         value.zero_()
 
         device = torch.device(ppo.device)
-        return recorded(self._minibatches, restore, device, self._record, "PPO's update")
+        return recorded(self._minibatches, restore, device, self._record, "the update of PPO")
 
     def _minibatches(self) -> None:
         """All minibatches of an update: gathered, differentiated, and a step of Adam for each."""

@@ -64,8 +64,9 @@ class Clock:
         self._last = now
 
 
-FEW_EPISODES = 256
-"""Up to so many episodes the compiled loops of a CPU evaluate faster than the graphs of a GPU."""
+FEW_EPISODES = 64
+"""Up to so many episodes are evaluated on the CPU: a step of 64 takes a core as long as the graphs
+of a GPU take for any number, which have to be recorded first (docs/results/speed.md)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,8 +43,9 @@ class GraphedEpisodes:
     def __init__(self, task: Task, count: int, record: Callable[..., Any] = cuda_graph):
         """record: what makes graphs; in place of `cuda_graph` where there is no GPU."""
         self.task, self.count = task, count
-        self.plain, self._record = Episodes(task, donate=True), record
-        """The same, one operation after the other."""
+        self.plain = Episodes(task, donate=True)
+        """The same episodes, one operation after the other."""
+        self._record = record
         self._state: TaskState | None = None
         self._work: dict[tuple, Callable[[], Any]] = {}
         device = task.world.device
@@ -76,7 +77,7 @@ class GraphedEpisodes:
         """Start new episodes where mask (B,) is set, each with its random number stream."""
         held = self.held(state)
         for _, places in self._parts(mask.nonzero()[:, 0]):
-            self._done(("reset", len(places)), partial(self._restarted, places))
+            self._done(("start", len(places)), partial(self._restarted, places))
         return held
 
     @torch.inference_mode()
@@ -87,7 +88,7 @@ class GraphedEpisodes:
         in which `seen` was observed."""
         held, found = self.held(state), dict(seen)
         for part, places in self._parts(index):
-            name = ("observe", len(places))
+            name = ("observation", len(places))
             fresh = self._done(name, partial(self._observed, held, places))
             for agent, value in fresh.items():
                 found[agent] = found[agent].index_copy(0, part, value[: len(part)])
@@ -114,7 +115,7 @@ class GraphedEpisodes:
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         """Clipped observations, agent -> (B, D), see `Episodes.observe`."""
         held = self.held(state)
-        seen = self._done(("observe",), partial(self.plain.observe, held))
+        seen = self._done(("observation",), partial(self.plain.observe, held))
         return {agent: value.clone() for agent, value in seen.items()}
 
     def advanced(self, actions: Mapping[str, Tensor]) -> Packed[Outcome]:
@@ -143,7 +144,7 @@ class GraphedEpisodes:
     def _done(self, name: tuple, work: Callable[[], Any]) -> Any:
         """The results of a recorded function, which is recorded at its first call."""
         if name not in self._work:
-            what, device = f"{name[0]} of {self.task.name}", self.task.world.device
+            what, device = f"the {name[0]} of {self.task.name}", self.task.world.device
             self._work[name] = recorded(work, self.kept(), device, self._record, what)
         return self._work[name]()
 

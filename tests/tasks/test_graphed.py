@@ -100,7 +100,7 @@ def test_what_cannot_be_recorded_is_done_step_by_step_with_a_warning():
     actions = {"arm": torch.ones(3, task.world.arms["arm"].chambers)}
     with torch.inference_mode():
         state, expected = recorded.seeded(0, 3), plain.seeded(0, 3)
-        with pytest.warns(AssumptionWarning, match="graph of step of track_circle.*permitted"):
+        with pytest.warns(AssumptionWarning, match="made of the step of track_circle.*permitted"):
             state, _ = recorded.step(state, actions)
         expected, _ = plain.step(expected, actions)
         state, _ = recorded.step(state, actions)

@@ -143,6 +143,8 @@ def main() -> None:
     parser.add_argument("--agree", default="")
     parser.add_argument("--compile", action="store_true", help="the arms by torch.compile, too")
     chosen = parser.parse_args()
+    if not torch.cuda.is_available():
+        parser.error("PyTorch finds no NVIDIA GPU here; run it on a machine that has one")
     device = torch.device("cuda")
     print(f"{torch.cuda.get_device_name()}, PyTorch {torch.__version__}")
     if chosen.agree:

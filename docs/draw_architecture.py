@@ -251,8 +251,8 @@ def _box(
     """A box with a name and lines below it."""
     middle = x + width / 2
     return [
-        f'<rect x="{x:g}" y="{y:g}" width="{width:g}" height="{_tall(about):g}" rx="5" fill="{fill}" '
-        f'stroke="{frame}"/>',
+        f'<rect x="{x:g}" y="{y:g}" width="{width:g}" height="{_tall(about):g}" rx="5" '
+        f'fill="{fill}" stroke="{frame}"/>',
         f'<text x="{middle:g}" y="{y + 19:g}" text-anchor="middle" font-size="14" '
         f'font-weight="bold" fill="#1b2733">{name}</text>',
         *(

@@ -1,8 +1,8 @@
 """An NVIDIA GPU: how far its episodes are from the CPU's, and its steps of the world and of PPO.
 
-    python benchmarks/gpu.py [--tasks track_circle,circle_ablation] [--envs 4096,65536]
-    python benchmarks/gpu.py --compile
-    python benchmarks/gpu.py --agree all
+    python -m benchmarks.gpu [--tasks track_circle,circle_ablation] [--envs 4096,65536]
+    python -m benchmarks.gpu --compile
+    python -m benchmarks.gpu --agree all
 
 With --agree a table of the largest differences between episodes stepped as CUDA graphs and the same
 ones on the CPU, with the same random actions and resets: key points and clearance, mm, the beam's

@@ -1,7 +1,7 @@
 """Steps of the world and of PPO on one thread and on several, on the clock.
 
-    python benchmarks/threads.py [--tasks circle_ablation,track_circle] [--envs 1024,4096]
-    python benchmarks/threads.py --blocks 128,256,512,1024
+    python -m benchmarks.threads [--tasks circle_ablation,track_circle] [--envs 1024,4096]
+    python -m benchmarks.threads --blocks 128,256,512,1024
 
 Every figure is the best of several rounds, in which one thread and all of them take turns. The
 ratio is what further threads are worth; other programs on the machine lower it. With --blocks the

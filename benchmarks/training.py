@@ -1,6 +1,6 @@
 """Cost of a training step by rollout and update, compared with the peak of matrix products.
 
-    python benchmarks/training.py [TASK]
+    python -m benchmarks.training [TASK]
 
 Processor time of one thread. The limit by operations counts the matrix products alone: the arm's
 network once a step; actor and critic once in the rollout, and in each epoch forward and backward

@@ -20,7 +20,7 @@ from surgisoft.workers import openblas_threads
 
 BLOCK = 512
 """Rows of a block (a count): the activations of a network of 128 neurons, 256 kB in float32, stay
-in the second cache of a core; `python benchmarks/threads.py --blocks 128,256,512,1024`."""
+in the second cache of a core; `python -m benchmarks.threads --blocks 128,256,512,1024`."""
 
 
 class _Rows(threading.local):

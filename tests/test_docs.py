@@ -150,3 +150,17 @@ def test_the_site_shows_blocks_as_code():
 def test_no_bar_is_escaped_inside_code(page):
     """The site shows the backslash of `a\\|b` in a table."""
     assert not re.findall(r"`[^`\n]*\\\|[^`\n]*`", without_code(page.read_text()))
+
+
+def test_benchmarks_that_import_others_are_called_as_modules():
+    """`python benchmarks/NAME.py` puts its own folder on Python's path and not the root, so that it
+    cannot import `benchmarks`."""
+    called = {
+        (place.relative_to(ROOT), name)
+        for place in [*PAGES, *(ROOT / "benchmarks").rglob("*.py")]
+        for name in re.findall(r"python benchmarks/(\w+)\.py", place.read_text())
+    }
+    assert len(called) > 10
+    for place, name in sorted(called):
+        source = (ROOT / "benchmarks" / f"{name}.py").read_text()
+        assert not re.search(r"^(from|import) benchmarks\b", source, re.MULTILINE), (place, name)

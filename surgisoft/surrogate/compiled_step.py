@@ -1,8 +1,8 @@
-"""A time step of a HAW-NN, with or without hysteresis, in two compiled parts and its products.
+"""A time step of a HAW-NN, with or without hysteresis and arcs, in compiled parts and its products.
 
 `Chain.step` is the reference: it takes every effect and network, and is differentiable. Here the
-memories and directions of all arms are one compiled loop in front of the network's matrix products.
-Both agree to rounding.
+memories and directions of all arms are one compiled loop in front of the network's matrix products,
+and the chain of arcs of its prior mean is one behind them. Both agree to rounding.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from surgisoft.compiled import compiled
 from surgisoft.surrogate.arm import ArmState
 from surgisoft.surrogate.effects.hysteresis import Hysteresis
 from surgisoft.surrogate.model import ArmModel
-from surgisoft.surrogate.networks import HawNN
+from surgisoft.surrogate.networks import ArcChain, HawNN, rotation
 from surgisoft.threads import over_rows
 
 LANES = 16
@@ -40,6 +40,7 @@ class CompiledStep:
         self._tensors = [*model.parameters(), *model.buffers()]
         self._seen: list[tuple[int, int]] = []
         self._constants: list[np.ndarray] = []
+        self._arcs: list[np.ndarray] = []
         self._last: tuple[Tensor, Tensor] | None = None
 
     @classmethod
@@ -47,7 +48,7 @@ class CompiledStep:
         """The compiled step of a model; None where only the reference can step it."""
         network, effects = model.network, dict(model.effects)
         name, effect = next(iter(effects.items()), (None, None))
-        if type(network) is not HawNN or network.prior is not None or len(effects) > 1:
+        if type(network) is not HawNN or len(effects) > 1:
             return None
         if not (effect is None or type(effect) is Hysteresis):
             return None
@@ -99,10 +100,12 @@ class CompiledStep:
         seen = [(t.data_ptr(), 0 if t.is_inference() else t._version) for t in self._tensors]
         if seen != self._seen:
             self._seen, self._constants, self._last = seen, self._read(), self._wide_last_layer()
-        constants, last = self._constants, self._last
+            self._arcs = self._read_arcs()
+        constants, last, arcs = self._constants, self._last, self._arcs
         memories = [] if self.name is None else [_array(memory), _array(after)]
         loop = _advance if self.name is None else _advance_with_plays
         flat = None if points_mm is None else points_mm.view(count, -1)
+        filled = None if points_mm is None else _array(points_mm)
         assert last is not None
 
         def work(rows: slice) -> None:
@@ -117,6 +120,8 @@ class CompiledStep:
                     y = nn.functional.silu(y, inplace=True)
             y = torch.addmm(last[1], y, last[0])[:, : len(network.mean)]
             torch.addcmul(network.mean, y, network.scale, out=flat[rows])
+            if arcs:
+                _add_arcs(arrays[-1][rows], *arcs, filled[rows])
 
         held = {} if self.name is None else {self.name: after}
         return ArmState(pressure, anchor, direction, held), work
@@ -142,6 +147,10 @@ class CompiledStep:
         chain = (model.still, model.idle, model.band)
         constants = [_array(t) for t in (*chain, network.centre, network.half_range, network.use)]
         return constants + ([] if self._hysteresis is None else _plays(self._hysteresis))
+
+    def _read_arcs(self) -> list[np.ndarray]:
+        """Constants of the prior mean's loop; none without a prior mean."""
+        return [] if self._network.prior is None else _chain_of(self._network.prior)
 
 
 class LoneArmModel:
@@ -179,6 +188,8 @@ class LoneArmModel:
             np.empty((2, max(widths)), np.float32),
             self.points_mm.reshape(-1),
         )
+        arcs = compiled_step._read_arcs()
+        self._arcs = (x, *arcs, self.points_mm) if arcs else None
         self._turn = 0
 
     @property
@@ -206,6 +217,8 @@ class LoneArmModel:
         self._advance(*self._calls[self._turn])
         self._turn = 1 - self._turn
         _layers(*self._network)
+        if self._arcs is not None:
+            _add_arcs(*self._arcs)
 
 
 @compiled
@@ -254,6 +267,67 @@ def _plays(effect: Hysteresis) -> list[np.ndarray]:
     lines = effect.linear.movedim(0, -1), effect.bent.movedim(0, -1)
     parts = (effect.centre, effect.half_range, effect.use, *lines, origin)
     return [_array(t) for t in (*parts, radius, *wide)]
+
+
+def _chain_of(prior: ArcChain) -> list[np.ndarray]:
+    """Constants of a chain of A arcs: table (A, 3, m + 1), lengths (A,) and offsets (A, 3) in mm,
+    and place (3,) in mm and turn (3, 3) of its base, all in the base frame."""
+    unit = prior.length_mm.mean()
+    parts = (
+        prior.table,
+        prior.length_mm,
+        unit * prior.offset,
+        prior.base_mm + unit * prior.base_shift,
+        rotation(prior.base_turn),
+    )
+    return [_array(t) for t in parts]
+
+
+@compiled
+def _add_arcs(x, table, length_mm, offset_mm, base_mm, base_turn, points_mm):
+    """Add a chain of arcs to key points (B, n, 3) in mm; see `ArcChain.forward`.
+
+    x: (B, m or more) scaled actuation, in the first m columns; the others are those of `_chain_of`.
+    """
+    one, half = np.float32(1.0), np.float32(0.5)
+    arcs, chambers = table.shape[0], table.shape[2] - 1
+    behind = points_mm.shape[1] - arcs
+    place, turn, next_turn = np.empty_like(base_mm), np.empty_like(base_turn), base_turn.copy()
+    for b in range(len(x)):
+        for i in range(3):
+            place[i] = base_mm[i]
+            if behind:
+                points_mm[b, 0, i] += place[i]
+            for j in range(3):
+                turn[i, j] = base_turn[i, j]
+        for a in range(arcs):
+            bend_x, bend_y = table[a, 0, chambers], table[a, 1, chambers]
+            stretch = table[a, 2, chambers]
+            for m in range(chambers):
+                bend_x += table[a, 0, m] * x[b, m]
+                bend_y += table[a, 1, m] * x[b, m]
+                stretch += table[a, 2, m] * x[b, m]
+            angle = math.sqrt(bend_x * bend_x + bend_y * bend_y + np.float32(1e-12))
+            along = math.sin(angle) / angle
+            across = math.sin(half * angle) / (half * angle)
+            across *= half * across
+            length = length_mm[a] * math.exp(stretch)
+            ahead_x, ahead_y, ahead_z = across * bend_x, across * bend_y, along
+            # The rotation about (-y, x, 0), column by column.
+            xx, xy = across * bend_x * bend_x, across * bend_x * bend_y
+            yy = across * bend_y * bend_y
+            for i in range(3):
+                u, v, w = turn[i, 0], turn[i, 1], turn[i, 2]
+                place[i] += length * (u * ahead_x + v * ahead_y + w * ahead_z)
+                next_turn[i, 0] = u * (one - xx) - v * xy - w * along * bend_x
+                next_turn[i, 1] = v * (one - yy) - u * xy - w * along * bend_y
+                next_turn[i, 2] = along * (u * bend_x + v * bend_y) + w * (one - xx - yy)
+            for i in range(3):
+                point = place[i]
+                for j in range(3):
+                    turn[i, j] = next_turn[i, j]
+                    point += next_turn[i, j] * offset_mm[a, j]
+                points_mm[b, behind + a, i] += point
 
 
 @compiled

@@ -227,7 +227,7 @@ def weighted_mse(predicted: Tensor, measured: Tensor, weights: Tensor) -> Tensor
     return (weights * error.square()).sum() / seen.sum().clamp(min=1)
 
 
-def _rotation(vector: Tensor) -> Tensor:
+def rotation(vector: Tensor) -> Tensor:
     """(..., 3, 3) rotation matrices from rotation vectors (..., 3) in rad (Rodrigues 1840)."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
@@ -254,7 +254,7 @@ def arc_point(bend: Tensor, length: Tensor) -> Tensor:
 def arc_rotation(bend: Tensor) -> Tensor:
     """(..., 3, 3) rotation from the start to the end of an arc of bend (..., 2) rad, no twist."""
     x, y = bend.unbind(-1)
-    return _rotation(torch.stack([-y, x, torch.zeros_like(x)], -1))
+    return rotation(torch.stack([-y, x, torch.zeros_like(x)], -1))
 
 
 class ConstantCurvature(nn.Module):
@@ -308,7 +308,7 @@ class ConstantCurvature(nn.Module):
         x = (pressure - self.centre) / self.half_range
         x = torch.cat([x, torch.ones_like(x[..., :1])], -1)
         values = torch.einsum("scm,...m->...sc", self.table, x)
-        turn = _rotation(self.base_turn).expand(*x.shape[:-1], 3, 3)
+        turn = rotation(self.base_turn).expand(*x.shape[:-1], 3, 3)
         start = self.base_mm.expand(*x.shape[:-1], 3)
         points = [start] * self.key_points
         on = self._sections_of_points() if self._on is None else self._on
@@ -382,7 +382,7 @@ class ArcChain(nn.Module):
         x = (pressure - self.centre) / self.half_range
         values = torch.einsum("acm,...m->...ac", self.table[..., :-1], x) + self.table[..., -1]
         unit = self.length_mm.mean()
-        turn = _rotation(self.base_turn).expand(*x.shape[:-1], 3, 3)
+        turn = rotation(self.base_turn).expand(*x.shape[:-1], 3, 3)
         place = (self.base_mm + unit * self.base_shift).expand(*x.shape[:-1], 3)
         points = [place] if self.fixed_base else []
         for number, offset in enumerate(self.offset):

@@ -8,9 +8,13 @@ import pytest
 import torch
 
 from surgisoft.errors import InputError
+from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
+from surgisoft.surrogate.compiled_step import CompiledStep
+from surgisoft.surrogate.effects import make_effect
 from surgisoft.surrogate.fit import FitConfig, fit
 from surgisoft.surrogate.history import pack
+from surgisoft.surrogate.model import ArmModel, arm_facts
 from surgisoft.surrogate.networks import ArcChain, HawEnsemble, HawNN
 from surgisoft.surrogate.prior_mean import arcs_of, fit_prior_mean
 from tests.surrogate.truth import SPEC, history, walk
@@ -120,6 +124,39 @@ def test_the_network_adds_to_its_prior_mean():
     ensemble = HawEnsemble.of([network, network])
     assert torch.allclose(ensemble(pressure, direction), expected, atol=1e-4)
     assert torch.allclose(ensemble.each(pressure, direction)[1], expected, atol=1e-4)
+
+
+@pytest.mark.parametrize(("key_points", "arcs"), [(2, 2), (3, 2), (6, 5)])
+@pytest.mark.parametrize("effects", [(), ("hysteresis",)])
+def test_the_compiled_step_adds_the_same_arcs(key_points, arcs, effects):
+    random = torch.Generator().manual_seed(arcs)
+    spec = ArmSpec(2, key_points, (0.0, 0.0), (50.0, 50.0), band=(0.5, 0.5))
+    rest = torch.tensor([[0.0, 0.0, 20.0 * (k + key_points - arcs)] for k in range(key_points)])
+    rest = rest - rest[0] * (arcs < key_points)
+    made = {name: make_effect(name, arm_facts(spec, rest)) for name in effects}
+    network = HawNN(LOW, HIGH, key_points, hidden=(8,), arcs=arcs)
+    network.prior.set_rest(rest)
+    with torch.no_grad():
+        for values in network.prior.parameters():
+            values += 0.4 * torch.randn(values.shape, generator=random)
+        for values in network.layers.parameters():
+            values.copy_(torch.randn(values.shape, generator=random))
+    model = ArmModel(spec, network, made, rest).eval().requires_grad_(False)
+    compiled = CompiledStep.of(model)
+    state, alone = model.initial_state(7), model.initial_state(1)
+    pressure = np.zeros((1, 2), np.float32)
+    lone = compiled.alone(alone, pressure)
+    for _ in range(5):
+        ahead = 50.0 * torch.rand(7, 2, generator=random)
+        found = compiled(state, ahead)[1]
+        pressure[:] = ahead[:1].numpy()
+        lone.step()
+        state, expected = model.step(state, ahead - state.pressure, 0.05)
+        assert network.prior(ahead).abs().max() > 10.0
+        torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-4)
+        torch.testing.assert_close(
+            torch.tensor(lone.points_mm), expected[:1], rtol=1e-5, atol=1e-4
+        )
 
 
 def test_a_fit_with_prior_mean_round_trips_and_extrapolates(tmp_path):

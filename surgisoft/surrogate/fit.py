@@ -220,8 +220,9 @@ class FitConfig:
     members: int = 1
     """Networks whose mean is the prediction; above 1 an ensemble is trained behind the selection
     of inputs and effects, each member without another share of the training data."""
-    prior: str = "none"
-    """`none`, or `arcs`: a chain of arcs is fitted first, and the network to what is left."""
+    prior: str | None = None
+    """`arcs`: a chain of arcs is fitted first, and the network to what is left; `none`: the network
+    alone; None: arcs with HAW-NN, where the key points are a chain."""
     hidden: tuple[int, ...] = HIDDEN
     """Widths of the hidden layers of HAW-NN."""
     sections: int = 0
@@ -423,7 +424,10 @@ def _fit_stages(data: Data, spec, config, support, result: FitResult, progress) 
         if name == AUTO:
             _add_memory(data, spec, config, support, result, progress)
             continue
-        candidate = _grow(result.model, name, spec, config, support, data)
+        if result.model is None:
+            candidate = _first(name, spec, config, data, result)
+        else:
+            candidate = _grow(result.model, name, spec, config, support, data)
         epochs = _stage_epochs(name, grown, config)
         _stage(candidate, name, epochs, config, data, result, progress)
     interval = None
@@ -519,11 +523,11 @@ def _fit_recurrent(data: Data, spec, config, result: FitResult, progress) -> Non
 
 
 def _check(train: History, valid: History | None, spec: ArmSpec, config: FitConfig) -> None:
-    if config.prior not in PRIORS:
-        raise unknown_name("prior mean", config.prior, PRIORS)
+    if config.prior not in (None, *PRIORS):
+        raise unknown_name("prior mean", str(config.prior), PRIORS)
     if config.network not in NETWORKS:
         raise unknown_name("network", config.network, NETWORKS)
-    if config.prior != "none" and config.network not in (*GREY_BOXES, "kernel"):
+    if config.prior == "arcs" and config.network not in (*GREY_BOXES, "kernel"):
         raise InputError(
             f"a prior mean needs the network haw_nn, not {config.network}; change one of the two"
         )
@@ -627,23 +631,30 @@ def _supported(result: FitResult, name: str, config: FitConfig, support: _Suppor
     return bool(use.any())
 
 
-def _grow(
-    model: ArmModel | None, name: str, spec, config, support: _Support, data: Data
-) -> ArmModel:
-    """The model with one stage more and an unchanged prediction."""
+def _first(name: str, spec, config, data: Data, result: FitResult) -> ArmModel:
+    """The untrained model of the first stage; notes why it has no prior mean where none was
+    possible."""
     low, high = torch.tensor(spec.low), torch.tensor(spec.high)
-    if name == "pressure":
-        arcs = arcs_of(data.train.rows(data.train.key_points)) if config.prior == "arcs" else 0
-        network = HawNN(low, high, spec.key_points, config.hidden, directions=False, arcs=arcs)
-        if network.prior is not None:
-            fit_prior_mean(network.prior, data.fitted, rest_shape(data.train))
-        normalise(network, data.train)
-        return ArmModel(spec, network)
     if name == "constant curvature":
         sections = ConstantCurvature(low, high, spec.key_points, config.sections)
         sections.set_rest(rest_shape(data.train))
         return ArmModel(spec, sections)
-    assert model is not None, "the first stage is a network"
+    arcs = 0 if config.prior == "none" else arcs_of(data.train.rows(data.train.key_points))
+    network = HawNN(low, high, spec.key_points, config.hidden, directions=False, arcs=arcs)
+    if network.prior is not None:
+        try:
+            fit_prior_mean(network.prior, data.fitted, rest_shape(data.train))
+        except InputError as why:
+            if config.prior == "arcs":
+                raise
+            result.warnings.append(f"no prior mean: {why}")
+            network = HawNN(low, high, spec.key_points, config.hidden, directions=False)
+    normalise(network, data.train)
+    return ArmModel(spec, network)
+
+
+def _grow(model: ArmModel, name: str, spec, config, support: _Support, data: Data) -> ArmModel:
+    """The model with one stage more and an unchanged prediction."""
     use = support.use(name) if config.check_excitation else torch.ones(spec.chambers)
     grown = copy.deepcopy(model)
     if name == "direction":

@@ -15,6 +15,7 @@ chamber that hardly moved gets a large bend that fits the others' residuals.
 import torch
 from torch import Tensor
 
+from surgisoft.errors import InputError
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.networks import ArcChain
 
@@ -39,11 +40,19 @@ def arcs_of(points: Tensor) -> int:
 
 
 def fit_prior_mean(prior: ArcChain, history: History, rest: Tensor) -> None:
-    """Fit a prior mean to the measured rows of a history; rest: (n, 3) key points at rest, mm."""
+    """Fit a prior mean to the measured rows of a history; rest: (n, 3) key points at rest, mm.
+
+    Raises InputError where the key points are no chain at rest, or the arcs do not follow them.
+    """
     prior.set_rest(rest)
     points = history.rows(history.key_points)
     seen = (~points.isnan()).all(-1).any(-1)
-    fit_arcs(prior, history.rows(history.pressure)[seen], points[seen])
+    pressure, points = history.rows(history.pressure)[seen], points[seen]
+    fit_arcs(prior, pressure, points)
+    with torch.no_grad():
+        left = (points - prior(pressure)).square().nanmean()
+    if not left < (points - points.nanmean(0)).square().nanmean():
+        raise InputError("prior mean: the arcs do not follow the key points, expected a chain")
 
 
 def fit_arcs(

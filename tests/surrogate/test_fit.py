@@ -252,7 +252,7 @@ SMALL = FitConfig(hidden=(32, 32), epochs=60, inputs="pressure", batch=128)
 
 def test_an_ensemble_knows_its_error_on_runs_that_took_no_part():
     train, fresh = runs(range(12)), runs(range(50, 62))
-    result = fit(train, None, SPEC, replace(SMALL, members=4))
+    result = fit(train, None, SPEC, replace(SMALL, members=4, prior="none"))
     assert isinstance(result.model.network, HawEnsemble)
     interval = result.model.validation.interval
     assert interval.source == "cross-validation"
@@ -263,6 +263,23 @@ def test_an_ensemble_knows_its_error_on_runs_that_took_no_part():
     assert 0.91 <= coverage_of(error, found.radius_mm) <= 0.985
     assert result.stages[-1].valid_rmse_mm < result.stages[-1].simpler_rmse_mm
     assert any("4 members" in line for line in result.lines())
+
+
+def test_an_ensemble_ends_where_it_is_best_on_runs_that_its_members_left_out():
+    """Few noisy runs: the error of left-out runs falls for some epochs, and then rises."""
+    rng = np.random.default_rng(5)
+    train, fresh = (history([walk(n, rng) for _ in range(6)], seed=n) for n in (60, 150))
+    noise = 2.0 * torch.randn(train.key_points.shape, generator=torch.Generator().manual_seed(0))
+    noisy = replace(train, key_points=train.key_points + noise)
+    how = {"hidden": (64, 64), "learning_rate": 1e-2, "batch": 128, "inputs": "pressure"}
+    errors, held = {}, {}
+    for epochs in (30, 300):
+        config = FitConfig(members=3, epochs=epochs, prior="none", **how)
+        result = fit(noisy, None, SPEC, config)
+        held[epochs] = [row[3] for row in result.loss if row[0] == "ensemble"]
+        errors[epochs] = rmse(result.model, fresh)
+    assert held[300][-1] > 1.1 * min(held[300]), "else the last weights are the best ones"
+    assert errors[300] < 1.1 * errors[30]
 
 
 def test_a_single_network_states_an_interval_of_its_held_out_rows():

@@ -1,0 +1,49 @@
+"""The rod on its bench."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from benchmarks.generators import REST_S, Bench, Moved, Setup
+from benchmarks.strain_rod import motion
+from benchmarks.strain_rod.hidden import switch_on
+from benchmarks.strain_rod.robot import STREAM, make_robot
+
+
+class StrainRodRig(Bench):
+    """One robot that is a rod of polynomial strains; records whole protocols."""
+
+    def __init__(
+        self,
+        seed: int,
+        take: int = 0,
+        noise: float = 1.0,
+        hidden: Sequence[tuple[str, float]] = (),
+    ) -> None:
+        """Switch a robot on.
+
+        take: number of the trial, which has noise of its own; noise: factor on all noise; hidden:
+        (name, strength) of effects of `benchmarks.strain_rod.hidden`.
+        """
+        robot = make_robot(seed)
+        sizes = len(robot.plant.areas), len(robot.plant.keys)
+        seeds = (seed, take, STREAM)
+        super().__init__(robot, robot.plant.high, robot.plant.gravity, sizes, seeds, noise)
+        self._plant = switch_on(Setup(robot.plant), hidden, seed).plant
+        self._state = motion.new_state(self._plant)
+        self._state.time[0] = -REST_S
+
+    def rest(self) -> float:
+        """Vent the robot and let it rest for REST_S; the time after it since switching on [s]."""
+        motion.rest(self._plant, self._state, REST_S)
+        return float(self._state.time[0])
+
+    def run(self, targets: np.ndarray) -> Moved:
+        """Follow set points (T, m) [Pa], one a sample, and read after each."""
+        steps = int(np.ceil(self.period_s / motion.STEP_S - 1e-9))
+        count, m, n = len(targets), self.chambers, self.key_planes
+        out = Moved(
+            np.empty((count, m)), np.empty((count, m)), np.empty((count, n, 3)), np.empty(count)
+        )
+        motion.run(self._plant, self._state, targets, self.period_s, steps, *out)
+        return out

@@ -7,11 +7,11 @@ models:
 | effect | law here | in the arm model |
 |---|---|---|
 | `payload` | weight beside the tip: a weight coincides | beam, to first order |
-| `hysteresis` | friction of fibres that pressure presses together (Tondu & Lopez 2000; Wen 1976) | \
-play operators on chambers |
+| `hysteresis` | friction of fibres that pressure presses together (Tondu & Lopez 2000; Wen \
+1976) | play operators on chambers |
 | `gain_mismatch` | two chambers of other areas: proportional, so it coincides | gain |
-| `line_lag` | turbulent flow in smooth hoses (Blasius 1913) with a volume between | one lag, laminar \
-to turbulent |
+| `line_lag` | turbulent flow in smooth hoses (Blasius 1913) with a volume between | one lag, \
+laminar to turbulent |
 | `creep` | flow by the hyperbolic sine of stress (Garofalo 1965) against a spring | retarded, \
 log-normal spectrum |
 | `misalignment` | rotation and shift of the cameras: coincides | rotation, shift, scale |
@@ -19,10 +19,10 @@ log-normal spectrum |
 | `contact` | a plate that stiffens exponentially, along the whole body (Winkler 1867) | one key \
 point and a plane |
 | `softening` | chains pulled out of hard domains (Qi & Boyce 2004) | exponential in energy |
-| `coupling` | septa that move at a constant section of all chambers (Laplace 1806) | polynomial of \
-loads |
-| `dead_zone` | threads of a fabric that become taut at logistic lengths (Verhulst 1838) | smoothed \
-by a root |
+| `coupling` | septa that move at a constant section of all chambers (Laplace 1806) | polynomial \
+of loads |
+| `dead_zone` | threads of a fabric that become taut at logistic lengths (Verhulst 1838) | \
+smoothed by a root |
 | `drift` | base that turns with a hyperbola of time (Ross 1937) | saturating exponential |
 | `stiffening` | chains of limited length under the section's mean square strain (Kuhn & Gruen \
 1942; Cohen 1991) | exponential (Fung) of loads |
@@ -31,17 +31,19 @@ polynomial of the mean load |
 | `thermal_drift` | entropic modulus, of a wall that follows the room (James & Guth 1943), weight \
 included | gain by temperature |
 
-Laws of other generators that come near: `hysteresis` has the form of PyElastica's with another power
-and a limit that goes with pressure; `creep` and PyElastica's fast viscosity both have a hyperbolic
-sine; chains of limited length are Gent's (PyElastica) to first order. A weight, a factor on the
-pressure and a rigid motion of the cameras coincide with all of them by nature.
+Laws of other generators that come near: `hysteresis` has the form of PyElastica's with another
+power and a limit that goes with pressure; `creep` and PyElastica's fast viscosity both have a
+hyperbolic sine; chains of limited length are Gent's (PyElastica) to first order. Slow flow in a
+hose and small stresses are linear here as in the arm models. A weight, a factor on the pressure and
+a rigid motion of the cameras coincide with all of them by nature.
 
-Unknown ones are `breathing` (a ventilator: a constant flow in, an exponential one out), `stick_slip`
-(the table is dragged slowly and slips back at irregular moments), `relief` (a valve behind the sensor
-that opens above a pressure and closes below a lower one), `crossflow` (two chambers exchange air in
-spells), `footsteps` (blows after which the table rings down), `fibre_break` (from one moment on a
-chamber pushes more over a part of its length), `winding_hose` (a pull at the tip that goes around)
-and `sunbeam` (one side of the arm is warmed in spells, and bends it).
+Unknown ones are `breathing` (a ventilator: a constant flow in, an exponential one out),
+`stick_slip` (the table is dragged slowly and slips back at irregular moments), `relief` (a valve
+behind the sensor that opens above a pressure and closes below a lower one), `crossflow` (two
+chambers exchange air in spells), `footsteps` (blows after which the table rings down),
+`fibre_break` (from one moment on a chamber pushes more over a part of its length), `winding_hose`
+(a pull at the tip that goes around) and `sunbeam` (one side of the arm is warmed in spells, and
+bends it).
 """
 
 import math
@@ -121,25 +123,25 @@ def _misalignment(setup: Setup, strength: float, rng: np.random.Generator) -> No
 
 
 def _rate_dependence(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    setup.change_wall(fluid=np.array([0.05 * strength, rng.uniform(3.0, 12.0)]))
+    setup.change_wall(fluid=np.array([0.07 * strength, rng.uniform(3.0, 12.0)]))
 
 
 def _contact(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     """A plate beside the upper half of the arm, on a side to which random pressures bend it."""
     plant, node = setup.plant, int(rng.integers(PARTS // 2 + 1, PARTS))
-    axis = _shapes(plant, rng)[:, node]
-    middle = axis.mean(axis=0)
-    way = axis[int(rng.integers(SHAPES))] - middle
+    shapes = _shapes(plant, rng)
+    way = shapes[int(rng.integers(SHAPES)), node] - shapes[:, node].mean(axis=0)
     way[2] *= 0.3
     way /= np.linalg.norm(way)
-    touched = 1.4 * math.exp(-0.5 * strength) * float(np.max((axis - middle) @ way))
-    point = middle + (touched + plant.radius) * way
-    stiffness = 3.0 * _tip_stiffness(plant) / (0.5 * plant.length)
-    setup.change(plate=np.array([*point, *-way, stiffness, 0.05 * plant.length]))
+    deepest = (shapes @ way).max(axis=1)  # of the body in each shape
+    low, high = float(deepest.min()), float(deepest.max())
+    touched = low + 1.1 * math.exp(-0.4 * strength) * (high - low) + plant.radius
+    stiffness = 4.0 * _tip_stiffness(plant) / (0.5 * plant.length)
+    setup.change(plate=np.array([*(touched * way), *-way, stiffness, 0.05 * plant.length]))
 
 
 def _softening(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    setup.change_wall(damage=0.9 * -math.expm1(-0.5 * strength))
+    setup.change_wall(damage=0.95 * -math.expm1(-0.5 * strength))
 
 
 def _coupling(setup: Setup, strength: float, rng: np.random.Generator) -> None:
@@ -183,11 +185,11 @@ def _stick_slip(setup: Setup, strength: float, rng: np.random.Generator) -> None
 
 
 def _relief(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    """It opens at 0.6 of the limit and closes at a third of it."""
+    """It opens at 0.45 of the limit and closes at 0.2 of it."""
     plant = setup.plant
     chamber = int(rng.integers(len(plant.areas)))
     vents = 0.1 * strength * plant.gas.line[chamber]
-    relief = np.array([chamber, 0.6 * plant.high, 0.33 * plant.high, vents])
+    relief = np.array([chamber, 0.45 * plant.high, 0.2 * plant.high, vents])
     setup.change(gas=plant.gas._replace(relief=relief))
 
 
@@ -209,7 +211,7 @@ def _footsteps(setup: Setup, strength: float, rng: np.random.Generator) -> None:
 def _fibre_break(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     """Over a third of the chamber's length."""
     plant, m = setup.plant, len(setup.plant.areas)
-    chamber, each = int(rng.integers(m)), plant.basis.shape[1]
+    chamber, each = int(rng.integers(m)), plant.basis.shape[0]
     first = each * (chamber // 3 if m == 6 else 0) + int(rng.integers(1, each // 3))
     moment = rng.uniform(*EVENT_WINDOW_S)
     broken = [chamber, first, first + each // 3, moment, 0.35 * strength]

@@ -26,7 +26,7 @@ from benchmarks.strain_rod.robot import GAUSS, PARTS, Plant
 from benchmarks.strain_rod.wall import Memory, forget, new_memory, remember, wall_stress
 from surgisoft.compiled import compiled
 
-STEP_S = 0.005
+STEP_S = 0.01
 """Longest time step [s]."""
 NEWTON = 2
 """Iterations of Newton's method in a step."""
@@ -36,13 +36,13 @@ SUN_S = 12.0
 """Time in which a side of the arm follows the sun [s]."""
 RESETS = 300
 """Steps of the weather within a reset."""
-SETTLED = 800
+SETTLED = 400
 """Steps in which an arm without memory comes to rest."""
 KELVIN = 273.15
 """Zero of the Celsius scale [K]."""
 DRIFT_S = 250.0
 """Time in which half of a mount's drift has occurred [s]."""
-DEEPEST = 3.0
+DEEPEST = 2.0
 """Depth in a plate beyond which its force is linear, over the depth at which it grows by e [-]."""
 
 
@@ -53,6 +53,8 @@ class State(NamedTuple):
     """(1,) time since the robot was switched on [s]."""
     shape: np.ndarray
     """(S, D) coefficients q of the polynomials [-]."""
+    last: np.ndarray
+    """(S, D) their change in the last step [-]."""
     strain: np.ndarray
     """(G, 4) strains at the Gauss points [-]."""
     load: np.ndarray
@@ -79,10 +81,11 @@ class State(NamedTuple):
 def new_state(plant: Plant) -> State:
     """A robot that was switched on and is at rest."""
     points = len(plant.bend)
-    segments = points // plant.basis.shape[1]
+    segments = points // plant.basis.shape[0]
     state = State(
         time=np.zeros(1),
         shape=np.zeros((segments, len(plant.component))),
+        last=np.zeros((segments, len(plant.component))),
         strain=np.zeros((points, 4)),
         load=np.zeros((points, 4)),
         memory=new_memory(points),
@@ -116,6 +119,7 @@ def rest(plant: Plant, state: State, seconds: float) -> None:
     forget(state.memory, state.strain)
     for _ in range(SETTLED):
         move(still, state, STEP_S)
+    state.last[:] = 0.0
     forget(state.memory, state.strain)
 
 
@@ -347,6 +351,52 @@ def load_arm(plant: Plant, state: State) -> None:
 
 
 @compiled
+def plate_stiffness(plant: Plant, state: State, matrix: np.ndarray) -> None:
+    """Stiffness (S, D, D) of the plate against each segment's polynomials, over the weight of a
+    Gauss point [N m]: sum over nodes of k J^T J, J by the geometric Jacobian."""
+    part, each = plant.length / PARTS, plant.basis.shape[0]
+    count = plant.component.shape[0]
+    row, lever = np.empty(count), np.empty(4)
+    for segment in range(matrix.shape[0]):
+        for d in range(count):
+            for e in range(count):
+                matrix[segment, d, e] = 0.0
+    for k in range(1, PARTS + 1):
+        depth = plant.radius
+        for d in range(3):
+            depth -= (state.nodes[k, d] - plant.plate[d]) * plant.plate[3 + d]
+        if depth <= 0.0:
+            continue
+        stiff = plant.plate[6] * math.exp(min(depth / plant.plate[7], DEEPEST))
+        stiff *= part * (0.5 if k == PARTS else 1.0) * 0.5 * part
+        x, y, z = plant.plate[3], plant.plate[4], plant.plate[5]
+        for segment in range(matrix.shape[0]):
+            for d in range(count):
+                row[d] = 0.0
+            for g in range(each):
+                point = segment * each + g
+                if point >= 2 * k:
+                    break
+                p = state.nodes[k, 0] - state.points[point, 0]
+                q = state.nodes[k, 1] - state.points[point, 1]
+                r = state.nodes[k, 2] - state.points[point, 2]
+                axes = state.sections[point]
+                for c in range(3):
+                    # (axis x way) . normal = axis . (way x normal)
+                    lever[c] = plant.reference[c] * (
+                        axes[0, c] * (q * z - r * y)
+                        + axes[1, c] * (r * x - p * z)
+                        + axes[2, c] * (p * y - q * x)
+                    )
+                lever[3] = plant.reference[3] * (axes[0, 2] * x + axes[1, 2] * y + axes[2, 2] * z)
+                for d in range(count):
+                    row[d] += plant.basis[g, d] * lever[plant.component[d]]
+            for d in range(count):
+                for e in range(count):
+                    matrix[segment, d, e] += stiff * row[d] * row[e]
+
+
+@compiled
 def push(plant: Plant, pressures: np.ndarray, chamber: int) -> float:
     """Pressure with which a chamber pushes on its nominal area [Pa]."""
     m = pressures.shape[0]
@@ -397,17 +447,21 @@ def move(plant: Plant, state: State, step: float) -> None:
     place_arm(plant, state)
     load_arm(plant, state)
     weather(plant, state, step)
-    count, m, each = plant.component.shape[0], plant.areas.shape[0], plant.basis.shape[1]
+    count, m, each = plant.component.shape[0], plant.areas.shape[0], plant.basis.shape[0]
     ring = 3 if m == 6 else m
     weights = np.empty(4)
     for c in range(4):
         weights[c] = plant.ratio[c] * (plant.reference[c] / plant.reference[0]) ** 2
     factor = 1.0 + plant.warmth * state.warm[0] / (KELVIN + ROOM_C)
     broken = since(state.time[0], plant.broken[3]) if plant.broken[3] > 0.0 else 0.0
+    segments = state.shape.shape[0]
+    touched = np.empty((segments, count, count))
+    if plant.plate[6] > 0.0:
+        plate_stiffness(plant, state, touched)
     pushes, wanted = np.empty((each, 4)), np.empty((each, 4))
     before, stress, slope = np.empty((each, 4)), np.empty(4), np.empty((4, 4))
-    matrix, right = np.empty((count, count)), np.empty(count)
-    for segment in range(state.shape.shape[0]):
+    matrix, right, scaled = np.empty((count, count)), np.empty(count), np.empty((4, count))
+    for segment in range(segments):
         pressed = 0.0
         for c in range(4):
             for g in range(each):
@@ -432,11 +486,23 @@ def move(plant: Plant, state: State, step: float) -> None:
                 wanted[g, c] = plant.reference[c] * (pushes[g, c] + state.load[point, c])
                 if c < 2:
                     wanted[g, c] += unit * (plant.bow[point, c] + state.warm[1] * plant.sun[c])
+            # Newton's method starts from the rate of the step before.
+            for d in range(count):
+                state.strain[point, plant.component[d]] += (
+                    plant.basis[g, d] * state.last[segment, d]
+                )
+        for d in range(count):
+            state.shape[segment, d] += state.last[segment, d]
         for _ in range(NEWTON):
             for d in range(count):
                 right[d] = 0.0
                 for e in range(d + 1):
                     matrix[d, e] = 0.0
+                if plant.plate[6] > 0.0:
+                    for e in range(count):
+                        right[d] -= touched[segment, d, e] * state.last[segment, e]
+                    for e in range(d + 1):
+                        matrix[d, e] = touched[segment, d, e]
             for g in range(each):
                 point = segment * each + g
                 unit = plant.bend[point] * plant.reference[0] ** 2
@@ -453,23 +519,23 @@ def move(plant: Plant, state: State, step: float) -> None:
                     stress,
                     slope,
                 )
+                for c in range(4):
+                    stress[c] = wanted[g, c] - unit * stress[c]
+                    for e in range(count):
+                        scaled[c, e] = unit * slope[c, plant.component[e]] * plant.basis[g, e]
                 for d in range(count):
-                    c = plant.component[d]
-                    right[d] += plant.basis[d, g] * (wanted[g, c] - unit * stress[c])
+                    c, basis = plant.component[d], plant.basis[g, d]
+                    right[d] += basis * stress[c]
                     for e in range(d + 1):
-                        matrix[d, e] += (
-                            plant.basis[d, g]
-                            * plant.basis[e, g]
-                            * unit
-                            * slope[c, plant.component[e]]
-                        )
+                        matrix[d, e] += basis * scaled[c, e]
             solve(matrix, right)
             for d in range(count):
                 state.shape[segment, d] += right[d]
+                state.last[segment, d] += right[d]
             for g in range(each):
                 for d in range(count):
                     state.strain[segment * each + g, plant.component[d]] += (
-                        plant.basis[d, g] * right[d]
+                        plant.basis[g, d] * right[d]
                     )
         for g in range(each):
             point = segment * each + g

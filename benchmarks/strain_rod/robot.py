@@ -109,7 +109,7 @@ class Plant(NamedTuple):
     gravity: np.ndarray
     """(3,) acceleration of weight in the frame of the bench [m/s^2]."""
     basis: np.ndarray
-    """(D, G / S) polynomials of a segment at its Gauss points [-]."""
+    """(G / S, D) polynomials of a segment at its Gauss points [-]."""
     component: np.ndarray
     """(D,) component of strain of each polynomial: 0, 1 bending, 2 torsion, 3 stretch."""
     bend: np.ndarray
@@ -195,14 +195,14 @@ def build_of(seed: int) -> Build:
 
 
 def polynomials(parts: int) -> tuple[np.ndarray, np.ndarray]:
-    """(D, 2 parts) Legendre polynomials of a segment at its Gauss points, and (D,) components."""
+    """(2 parts, D) Legendre polynomials of a segment at its Gauss points, and (D,) components."""
     places = (np.arange(parts)[:, None] + np.array(GAUSS)).ravel() / parts
     rows = [
         legendre.legval(2.0 * places - 1.0, np.eye(terms)[k])
         for terms in TERMS
         for k in range(terms)
     ]
-    return np.array(rows), np.repeat(np.arange(len(TERMS)), TERMS)
+    return np.array(rows).T.copy(), np.repeat(np.arange(len(TERMS)), TERMS)
 
 
 @functools.cache

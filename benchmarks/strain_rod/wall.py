@@ -13,7 +13,8 @@ in these units. Memory counts from the strain at rest x_0. A section carries
 - creep: a strain y in series, whose flow is the hyperbolic sine of stress (Garofalo 1965) against
   a spring that brings it back, dy/dt = c s_0 sinh(s / s_0) / tau, s = x - x_0 - y / c;
 - damage: chains that are pulled out of hard domains and remain so (Qi & Boyce 2004, eq. 14), a
-  share d v(X) of the stiffness at the largest X = |x - x_0|_a / 2 so far,
+  share d v(X) of the stiffness at the largest X = |x - x_0|_a / 1.5 so
+  far,
   v(X) = 1 - exp(-X / (1 - X)), scaled so that first loading stays as it was;
 - a fluid of Powell & Eyring (1944), e asinh(lambda x'), beside the linear dashpot tau x';
 - helical fibres that couple stretch and torsion, as those of a wire rope do (Love 1927, sec. 290;
@@ -30,7 +31,7 @@ from surgisoft.compiled import compiled
 
 NEAR_STRAIGHT = 0.7
 """I beyond which the stiffness of chains is continued linearly [-]."""
-FAR = 2.0
+FAR = 1.5
 """Strain at which all chains are pulled out [-]."""
 HELD = 0.97
 """Largest X that the damage counts [-]."""
@@ -80,7 +81,7 @@ def pulled_out(strain: float) -> float:
 
 @compiled
 def slipped(state: np.ndarray, moved: np.ndarray, slip: float, out: np.ndarray) -> None:
-    """State z (4,) of the friction after a strain (4,) has moved; implicit, so |z| stays below 1."""
+    """State z (4,) of the friction after a strain (4,) has moved; implicit: |z| stays below 1."""
     along = 0.0
     for c in range(4):
         along += state[c] * moved[c]

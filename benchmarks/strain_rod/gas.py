@@ -6,8 +6,8 @@ the power -1/4 of Reynolds' number (Blasius 1913), so that the flow is
     q = c d (d^2 / d_0^2 + e^2)^(-3/14),   d = (P_1^2 - P_2^2) / (2 P_a),
 
 a power 4/7 of the difference of the squares, and linear (laminar) close to zero. A hose is two
-such halves with a volume between them. A chamber's volume V(p) grows in proportion to its pressure, and
-its air is isothermal: d(P V)/dt = q. Both pressures follow by an implicit step with the
+such halves with a volume between them. A chamber's volume V(p) grows in proportion to its pressure,
+and its air is isothermal: d(P V)/dt = q. Both pressures follow by an implicit step with the
 conductances of the step before. A regulator is a linear system of second order; its sensor is in
 front of the hose.
 """

@@ -135,7 +135,7 @@ def _contact(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     way /= np.linalg.norm(way)
     deepest = (shapes @ way).max(axis=1)  # of the body in each shape
     low, high = float(deepest.min()), float(deepest.max())
-    touched = low + 1.1 * math.exp(-0.4 * strength) * (high - low) + plant.radius
+    touched = high - 0.35 * strength**0.45 * (high - low) + plant.radius
     stiffness = 4.0 * _tip_stiffness(plant) / (0.5 * plant.length)
     setup.change(plate=np.array([*(touched * way), *-way, stiffness, 0.05 * plant.length]))
 

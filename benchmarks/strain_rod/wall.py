@@ -12,11 +12,11 @@ in these units. Memory counts from the strain at rest x_0. A section carries
   dz = dx / x_y - z |z . dx| / x_y;
 - creep: a strain y in series, whose flow is the hyperbolic sine of stress (Garofalo 1965) against
   a spring that brings it back, dy/dt = c s_0 sinh(s / s_0) / tau, s = x - x_0 - y / c;
-- damage: chains that are pulled out of hard domains and remain so (Qi & Boyce 2004, eq. 14), a
+- damage: chains that are pulled out of hard domains and remain so (Qi & Boyce 2004), a
   share d v(X) of the stiffness at the largest X = |x - x_0|_a / 1.5 so far,
   v(X) = 1 - exp(-X / (1 - X)), scaled so that first loading stays as it was;
 - a fluid of Powell & Eyring (1944), e asinh(lambda x'), beside the linear dashpot tau x';
-- helical fibres that couple stretch and torsion, as those of a wire rope do (Love 1927, sec. 290;
+- helical fibres that couple stretch and torsion, as those of a wire rope do (Love 1927;
   Cardou & Jolicoeur 1997): the energy a_2 (x_2 - h x_3)^2 / 2 in place of that of torsion.
 """
 

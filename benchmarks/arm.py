@@ -17,6 +17,7 @@ import torch
 
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.backbone import Backbone
+from surgisoft.surrogate.compiled_step import CompiledStep
 from surgisoft.surrogate.effects import make_effect
 from surgisoft.surrogate.model import ArmModel, arm_facts
 from surgisoft.surrogate.networks import HawNN
@@ -44,13 +45,16 @@ def peak() -> float:
     return 2 * 2048**3 / best_seconds(lambda: a @ a, repeats=2, least=0.25)
 
 
-def arm(effects: tuple[str, ...]) -> ArmModel:
-    """An arm of the paper's size."""
+def arm(effects: tuple[str, ...], arcs: int = 0) -> ArmModel:
+    """An arm of the paper's size; arcs: those of its prior mean."""
     low, high = torch.tensor(SPEC.low), torch.tensor(SPEC.high)
     rest = torch.tensor([[0.0, 0.0, 17.5 * k] for k in range(SPEC.key_points)])
     facts = arm_facts(SPEC, rest)
     made = {name: make_effect(name, facts) for name in effects}
-    return ArmModel(SPEC, HawNN(low, high, 5), made, rest).eval().requires_grad_(False)
+    network = HawNN(low, high, 5, arcs=arcs)
+    if network.prior is not None:
+        network.prior.set_rest(rest)
+    return ArmModel(SPEC, network, made, rest).eval().requires_grad_(False)
 
 
 def stepper(effects: tuple[str, ...], dp: torch.Tensor):
@@ -58,6 +62,14 @@ def stepper(effects: tuple[str, ...], dp: torch.Tensor):
     model = arm(effects)
     state = model.initial_state(len(dp))
     return lambda: model.step(state, dp, 0.05)
+
+
+def compiled_stepper(effects: tuple[str, ...], pressure: torch.Tensor, arcs: int = 0):
+    """A function that steps a batch once to a pressure (B, 3) by compiled loops."""
+    model = arm(effects, arcs)
+    step, state = CompiledStep.of(model), model.initial_state(len(pressure))
+    assert step is not None
+    return lambda: step(state, pressure)
 
 
 def network(x: torch.Tensor):
@@ -87,6 +99,8 @@ def main() -> None:
             "network alone": network(dp),
             "step": plain,
             "step with hysteresis": deep,
+            "the same, compiled": compiled_stepper(("hysteresis",), dp),
+            "and with arcs": compiled_stepper(("hysteresis",), dp, arcs=4),
             "backbone, 21 points + tip": partial(whole_body, spline, points),
         }
         for name, work in rows.items():

@@ -109,7 +109,10 @@ def fit_one(task: tuple[int, Case, Path]) -> Outcome:
         load_recording(folder / f"{name}-{seed}.parquet") for name in ("grid", "validation", "test")
     )
     result = fit(
-        history_of([train]), history_of([valid]), arm_spec([train]), FitConfig(**case.options)
+        history_of([train]),
+        history_of([valid]),
+        arm_spec([train]),
+        FitConfig(**{"prior": "none"} | case.options),
     )
     comparison, _ = compare(result.model, [test])
     save_model(result.model, folder / model_name(seed, case), force=True)

@@ -278,7 +278,7 @@ def own_model(robot: int, folder: Path) -> Path:
     place = folder / "models" / f"robot-{robot}"
     if not (place / "config.json").is_file():
         recording = ten_minutes(robot)
-        config = FitConfig(effects=("hysteresis",), seed=robot)
+        config = FitConfig(effects=("hysteresis",), prior="none", seed=robot)
         result = fit(history_of([recording]), None, arm_spec([recording]), config)
         save_model(result.model, place, result.report(), force=True, known=result.known)
     return place

@@ -42,6 +42,8 @@ from surgisoft.workers import workers
 FIT_EFFECTS = ("hysteresis",)
 """Effects that a model of a source without models of its own is fitted with, as the robots of the
 benchmark `diagnosis` are."""
+FIT_PRIOR = "none"
+"""Its prior mean: that of the models from which evidence is stored."""
 FEW_EPOCHS = 10
 """Epochs of a model that is undertrained, as those of the own rig are."""
 OTHER = "unknown"
@@ -66,7 +68,7 @@ def model_folder(folder: Path, robot: str, work: Path, undertrained: bool = Fals
         about = place / "robot.json"
         budget = json.loads(about.read_text()).get("fit", {}) if about.is_file() else {}
         few = {"epochs": FEW_EPOCHS} if undertrained else {}
-        result = fit(place / "before", effects=FIT_EFFECTS, **budget | few)
+        result = fit(place / "before", effects=FIT_EFFECTS, prior=FIT_PRIOR, **budget | few)
         own.parent.mkdir(parents=True, exist_ok=True)
         save_model(result.model, own, result.report(), force=True, known=result.known)
     return own

@@ -39,7 +39,8 @@ def base_model(robot: int, folder: Path, undertrained: bool = False) -> ArmModel
     rig = VirtualRig(robot)
     train, _ = rig.record(make_protocol("grid", rig.limits, GRID_POINTS, seed=robot))
     valid, _ = rig.record(make_protocol("validation", rig.limits, None, seed=robot))
-    config = FitConfig(effects=("hysteresis",), seed=robot)
+    # Without a prior mean, as all models were from which evidence of this rig is stored.
+    config = FitConfig(effects=("hysteresis",), prior="none", seed=robot)
     if undertrained:
         config = replace(config, epochs=10)
     result = fit(history_of([train]), history_of([valid]), arm_spec([train]), config)

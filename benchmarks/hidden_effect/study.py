@@ -185,6 +185,7 @@ class Study:
             how = FitConfig(
                 inputs="pressure+direction" if memory else "pressure",
                 effects=("hysteresis",) if memory else (),
+                prior="none",  # the paper's network
             )
             result = fit(
                 history_of([train]),

@@ -28,10 +28,13 @@ from surgisoft.measurement.recordings import Recording, save_recording
 from surgisoft.progress import Progress, Stages
 from surgisoft.surrogate.checkpoint import save_model
 
+MODEL = FitOptions(prior="none")
+"""Options of the fit of the model that a diagnosis is asked with, and whose validated error is the
+unit of the changes: those of the models from which evidence is stored."""
 SIZES = (0.6, 1.0, 2.0)
-"""RMS changes of the key points, as multiples of the model's validated error, of single effects."""
+"""RMS changes of the key points by single effects, as multiples of the model's validated error."""
 PAIR_SIZE = 1.2
-"""RMS change by each of two effects, as a multiple of the model's validated error."""
+"""RMS change by each of two effects, as a multiple of it."""
 RATE_HZ = 25.0
 """Rows per second on which the rod is evaluated; the change is interpolated between them. The
 arms move below 2 Hz."""
@@ -333,7 +336,7 @@ def make_robot(name: str, data: Path, folder: Path, seed: int, tell: Progress) -
     before = _recordings(robot.before, data, "before")
     after = [_clocked(recording) for recording in _recordings(robot.after, data, "after")]
     place = folder / "robots" / name
-    model = fitted(before, FitOptions(), "measured", Cache(folder / "fits"), tell)
+    model = fitted(before, MODEL, "measured", Cache(folder / "fits"), tell)
     save_model(model, place / "model", {}, force=True)
     bench = bench_of(before, after)
     for number, recording in enumerate(before):

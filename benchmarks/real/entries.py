@@ -13,7 +13,7 @@ from surgisoft.measurement.histories import ACTUATIONS
 from surgisoft.measurement.importing import import_files, load_map
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.surrogate.effects import known_effects
-from surgisoft.surrogate.fit import FitConfig
+from surgisoft.surrogate.fit import PRIORS, FitConfig
 
 FOLDER = Path(__file__).parent
 """The entries of the project."""
@@ -67,7 +67,9 @@ class FitOptions:
     inputs: Annotated[str, one_of(("pressure", "pressure+direction"))] = FitConfig.inputs
     """Inputs of the network for each chamber."""
     effects: tuple[str, ...] = ()
-    """Effects that the model is fitted with."""
+    """Effects that the model is fitted with; `auto` lets held-out data choose."""
+    prior: Annotated[str, one_of(PRIORS)] | None = None
+    """Prior mean of the network; None: that of `surgisoft fit`."""
     widths: Annotated[
         tuple[Annotated[int, at_least(1)], ...],
         Rule("at least one width", lambda value: len(value) > 0),

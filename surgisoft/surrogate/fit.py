@@ -647,7 +647,7 @@ def _first(name: str, spec, config, data: Data, result: FitResult) -> ArmModel:
         except InputError as why:
             if config.prior == "arcs":
                 raise
-            result.warnings.append(f"no prior mean: {why}")
+            result.warnings.append(f"{why}; fitted without one")
             network = HawNN(low, high, spec.key_points, config.hidden, directions=False)
     normalise(network, data.train)
     return ArmModel(spec, network)

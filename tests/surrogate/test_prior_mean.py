@@ -20,6 +20,7 @@ from surgisoft.surrogate.prior_mean import arcs_of, fit_prior_mean
 from tests.surrogate.truth import SPEC, history, walk
 
 LOW, HIGH = torch.zeros(2), torch.full((2,), 50.0)
+TWO = ArmSpec(2, 3, (0.0, 0.0), (50.0, 50.0), band=(0.5, 0.5))
 LENGTHS = (80.0, 60.0)
 BENDS = (1.1, -0.9)
 
@@ -154,9 +155,7 @@ def test_the_compiled_step_adds_the_same_arcs(key_points, arcs, effects):
         state, expected = model.step(state, ahead - state.pressure, 0.05)
         assert network.prior(ahead).abs().max() > 10.0
         torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-4)
-        torch.testing.assert_close(
-            torch.tensor(lone.points_mm), expected[:1], rtol=1e-5, atol=1e-4
-        )
+        torch.testing.assert_close(torch.tensor(lone.points_mm), expected[:1], rtol=1e-5, atol=1e-4)
 
 
 def test_a_fit_with_prior_mean_round_trips_and_extrapolates(tmp_path):
@@ -178,6 +177,32 @@ def test_a_fit_with_prior_mean_round_trips_and_extrapolates(tmp_path):
     save_model(result.model, tmp_path / "arm")
     again = load_model(tmp_path / "arm")
     assert torch.equal(again.predict(test), result.model.predict(test))
+
+
+def test_a_network_has_a_prior_mean_unless_none_is_asked_for():
+    train, how = recorded(one_by_one()), {"hidden": (8,), "epochs": 10, "inputs": "pressure"}
+    for prior, network, arcs in (
+        (None, "haw_nn", 2),
+        ("arcs", "haw_nn", 2),
+        ("none", "haw_nn", 0),
+    ):
+        model = fit(train, None, TWO, FitConfig(prior=prior, network=network, **how)).model
+        assert model.network.arcs == arcs
+    baseline = fit(train, None, TWO, FitConfig(network="constant_curvature", **how)).model
+    assert baseline.network.sections == 1
+
+
+def test_key_points_that_are_no_chain_are_fitted_without_a_prior_mean():
+    """Two markers in one place at rest: the default leaves the arcs out, and who asks is told."""
+    seen, how = recorded(one_by_one()), {"hidden": (8,), "epochs": 10, "inputs": "pressure"}
+    twice = seen.key_points.clone()
+    twice[..., 2, :] = twice[..., 1, :]
+    train = replace(seen, key_points=twice)
+    result = fit(train, None, TWO, FitConfig(**how))
+    assert result.model.network.arcs == 0
+    assert any("coincide at rest" in one and "without one" in one for one in result.warnings)
+    with pytest.raises(InputError, match="two key points coincide at rest"):
+        fit(train, None, TWO, FitConfig(prior="arcs", **how))
 
 
 def test_impossible_chains_are_refused():

@@ -1,1 +1,1 @@
-"""A sixth generator of robots: a soft pneumatic arm in MuJoCo (Todorov et al. 2012)."""
+"""A fifth generator of robots: a soft pneumatic arm in MuJoCo (Todorov et al. 2012)."""

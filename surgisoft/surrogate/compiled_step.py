@@ -120,7 +120,7 @@ class CompiledStep:
                     y = nn.functional.silu(y, inplace=True)
             y = torch.addmm(last[1], y, last[0])[:, : len(network.mean)]
             torch.addcmul(network.mean, y, network.scale, out=flat[rows])
-            if arcs:
+            if arcs and filled is not None:
                 _add_arcs(arrays[-1][rows], *arcs, filled[rows])
 
         held = {} if self.name is None else {self.name: after}

@@ -90,6 +90,8 @@ class RefitCriteria:
     """Factor on the noise floor from which an error is far above it."""
     within: float = 1.2
     """Most error above the floor, in units of the model discrepancy, that the fit validated."""
+    of_fit: float = 0.5
+    """Share of the rows that are rows of the model's fit, from which a larger error counts, too."""
     p_value: float = 0.02
     """Largest family-wise p-value of an effect that is named."""
     gain: float = 0.25
@@ -251,7 +253,8 @@ def refit_reason(problem: Problem, mode: str) -> str:
 def reason_to_refit(problem: Problem) -> str:
     """Why the residuals of a model cannot decide and a refit can; empty where they can.
 
-    The error is far above the noise floor, and no larger than the validated error: an effect that
+    The error is far above the noise floor, and no larger than the validated error, or most rows are
+    those that the model was fitted to, where a larger error is no change of the arm: an effect that
     the network has learned to imitate would look like this.
     """
     error, floor = problem.rmse_mm, problem.floor_mm
@@ -260,12 +263,15 @@ def reason_to_refit(problem: Problem) -> str:
     excess = float(np.sqrt(max(error**2 - floor**2, 0.0)))
     if error < ASKED.over_floor * floor:
         return ""
-    if excess > ASKED.within * validated or not problem.model.trainable:
+    of_fit = (problem.in_fit or 0.0) >= ASKED.of_fit
+    if (excess > ASKED.within * validated and not of_fit) or not problem.model.trainable:
         return ""
+    size = f"no larger than the model's validated error ({validated:.3g} mm)"
+    if excess > ASKED.within * validated:
+        size = "these are the recordings that the model was fitted to"
     return (
-        f"the error ({error:.3g} mm) is far above the noise floor ({floor:.3g} mm) and no larger "
-        f"than the model's validated error ({validated:.3g} mm), so the network may imitate what "
-        "is missing"
+        f"the error ({error:.3g} mm) is far above the noise floor ({floor:.3g} mm) and {size}, so "
+        "the network may imitate what is missing"
     )
 
 

@@ -125,6 +125,22 @@ def test_a_lag_that_the_network_imitates_is_named(problem, found):
     assert time == pytest.approx(LAG_S, rel=0.35)
 
 
+def test_a_larger_error_is_no_change_on_the_rows_of_the_fit(problem):
+    """Five times the validated error: on the rows of the fit the network may still imitate a lag;
+    on other rows the arm may have changed."""
+    known = problem.model.fitted_rows
+    larger = replace(problem, discrepancy_mm=problem.discrepancy_mm / 5.0)
+    assert larger.in_fit == 1.0
+    assert "these are the recordings that the model was fitted to" in reason_to_refit(larger)
+    problem.model.fitted_rows = replace(known, hashes=())
+    try:
+        assert larger.in_fit == 0.0
+        assert reason_to_refit(larger) == ""
+        assert "validated error" in reason_to_refit(problem)
+    finally:
+        problem.model.fitted_rows = known
+
+
 def test_a_training_that_came_out_badly_names_no_effect(monkeypatch):
     """The network alone ends off in the first of two trainings, as it may by chance: half of all
     blocks then show a gain of every effect, though none is missing."""

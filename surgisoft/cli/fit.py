@@ -68,7 +68,7 @@ def fit(
         typer.Option(
             help="Prior mean: a chain of arcs, fitted first; the network learns the remainder. It "
             "lowers the error on motions unlike those of the recordings. Default: arcs with "
-            "haw_nn, where the key points are a chain; none: the network alone.",
+            "haw_nn, unless the network alone has less held-out error; none: the network alone.",
         ),
     ] = None,
     members: Annotated[

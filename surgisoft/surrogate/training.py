@@ -314,8 +314,11 @@ def train_jointly(
     deep = [p for effect in model.effects.values() for p in effect.memory_parameters()]
     deep += [p for _, effect in model.stage("line") for p in effect.amplitudes().values()]
     mine = {id(p) for p in deep}
-    flat = [p for p in model.parameters() if id(p) not in mine]
     model.train().requires_grad_(True)
+    prior = getattr(model.network, "prior", None)
+    if prior is not None:  # no validation row stops it, and off the data its bends would run away
+        prior.requires_grad_(False)
+    flat = [p for p in model.parameters() if id(p) not in mine and p.requires_grad]
     generator = torch.Generator().manual_seed(config.seed)
     trace = _trace(model, data)
     rows = data.fitted_rows(model, trace)

@@ -215,3 +215,22 @@ def test_impossible_chains_are_refused():
 
 def test_models_without_a_prior_mean_are_as_before():
     assert default_arm().network.prior is None
+
+
+def test_arcs_that_do_worse_on_held_out_runs_are_left_out():
+    """Held-out runs of an arm that does what a network makes of chambers that were recorded one by
+    one: another network is nearer to it than arcs are."""
+    rng = np.random.default_rng(8)
+    train, how = recorded(one_by_one()), {"hidden": (32, 32), "epochs": 60, "inputs": "pressure"}
+    asked = recorded(rng.uniform(0, 50, (300, 2)))
+    network = fit(train, None, TWO, FitConfig(prior="none", seed=5, **how)).model
+    valid = replace(asked, key_points=network.predict(asked))
+    fits = {
+        prior: fit(train, valid, TWO, FitConfig(prior=prior, **how))
+        for prior in (None, "arcs", "none")
+    }
+    error = {prior: one.model.validation.rmse_mm for prior, one in fits.items()}
+    assert error["none"] < 0.9 * error["arcs"], "else arcs do no worse"
+    assert fits[None].model.network.arcs == 0
+    assert error[None] == error["none"]
+    assert any("prior mean left out" in one for one in fits[None].warnings)

@@ -78,6 +78,7 @@ def arm_by_hand(lag_s: float = LAG_S, rows: int = 1200) -> Recording:
 
 def fitted_to(recording: Recording, **more) -> ArmModel:
     given = {"actuation": "commanded", "hidden": (24, 24), "epochs": 40, "inputs": "pressure"}
+    given["prior"] = "none"
     return fit([recording], **(given | more)).model
 
 
@@ -270,6 +271,7 @@ def test_what_the_network_has_learned_leads_to_a_refit(
     """Where the error is larger than auto asks for, but residuals cannot tell for this reason."""
     recording, model = lagging
     off = model.replace(validation=Validation(0.1, (0.1,) * model.spec.key_points, 300))
+    off.fitted_rows = None
     none = replace(named(None, found), verdict=Verdict("cannot_tell", (), "why", 0.5, why))
     monkeypatch.setattr(diagnosing, "result_of", lambda findings: none)
     monkeypatch.setattr(diagnosing, "fit_candidates_together", lambda *given, **more: found)
@@ -283,6 +285,7 @@ def test_an_error_beyond_the_validated_one_is_left_to_the_residuals(problem):
     model = problem.model.replace(
         validation=Validation(0.4 * problem.rmse_mm, (0.4 * problem.rmse_mm,) * 2, 300)
     )
+    model.fitted_rows = None  # other rows than those of the fit
     small = 0.4 * np.sqrt(np.nanmean(np.square(problem.residual).sum(2), axis=0))
     assert reason_to_refit(replace(problem, model=model, discrepancy_mm=small)) == ""
 

@@ -308,15 +308,15 @@ def train_jointly(
     """Train the network of a model and all its effects together, in place, on the fitted rows.
 
     The number of epochs is fixed and no validation row is looked at, so two models are compared
-    after the same training. The model ends with the running average of its weights. hold: called
-    after each epoch, to keep parameters in their ranges.
+    after the same training. The model ends with the running average of its weights; its prior mean
+    stays as it is. hold: called after each epoch, to keep parameters in their ranges.
     """
     deep = [p for effect in model.effects.values() for p in effect.memory_parameters()]
     deep += [p for _, effect in model.stage("line") for p in effect.amplitudes().values()]
     mine = {id(p) for p in deep}
     model.train().requires_grad_(True)
     prior = getattr(model.network, "prior", None)
-    if prior is not None:  # no validation row stops it, and off the data its bends would run away
+    if prior is not None:  # without validation and ridges, arcs would extrapolate badly
         prior.requires_grad_(False)
     flat = [p for p in model.parameters() if id(p) not in mine and p.requires_grad]
     generator = torch.Generator().manual_seed(config.seed)

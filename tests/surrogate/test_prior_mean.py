@@ -1,5 +1,6 @@
 """The prior mean: it recovers constant-curvature arms, and adds bends that were recorded singly."""
 
+import copy
 import math
 from dataclasses import replace
 
@@ -17,6 +18,7 @@ from surgisoft.surrogate.history import pack
 from surgisoft.surrogate.model import ArmModel, arm_facts
 from surgisoft.surrogate.networks import ArcChain, HawEnsemble, HawNN
 from surgisoft.surrogate.prior_mean import arcs_of, fit_prior_mean
+from surgisoft.surrogate.training import Data, JointTraining, train_jointly
 from tests.surrogate.truth import SPEC, history, walk
 
 LOW, HIGH = torch.zeros(2), torch.full((2,), 50.0)
@@ -234,3 +236,18 @@ def test_arcs_that_do_worse_on_held_out_runs_are_left_out():
     assert fits[None].model.network.arcs == 0
     assert error[None] == error["none"]
     assert any("prior mean left out" in one for one in fits[None].warnings)
+
+
+def test_training_together_with_effects_leaves_the_prior_mean_as_it_is():
+    train, how = recorded(one_by_one()), {"hidden": (8,), "epochs": 10, "inputs": "pressure"}
+    model = fit(train, None, TWO, FitConfig(prior="arcs", **how)).model
+    arcs, layers = (copy.deepcopy(part.state_dict()) for part in model_parts(model))
+    train_jointly(model, Data.split(train, None, 0), 2, JointTraining())
+    now_arcs, now_layers = (part.state_dict() for part in model_parts(model))
+    assert all(torch.equal(value, now_arcs[name]) for name, value in arcs.items())
+    assert any(not torch.equal(value, now_layers[name]) for name, value in layers.items())
+
+
+def model_parts(model):
+    """Prior mean and layers of a model's network."""
+    return model.network.prior, model.network.layers

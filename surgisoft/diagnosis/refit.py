@@ -64,10 +64,13 @@ class RefitConfig:
     seeds: int = 3
     """Trainings of each candidate, each with another part of the recordings left out, another order
     of the rows and other windows."""
+    early_epochs: int = 2
+    """Epochs after which the first rung is looked at early: of few rows, networks stay close to
+    the given one where more training makes them worse elsewhere."""
     first_epochs: int = 8
-    """Epochs of the first rung, for all candidates and the rival."""
+    """Further epochs of the first rung, for all candidates and the rival."""
     epochs: int = 30
-    """Epochs of the second rung, for the best candidates and the rival."""
+    """Further epochs of the second rung, for the best candidates and the rival."""
     finalists: int = 3
     """Most candidates of the second rung."""
     seed: int = 0
@@ -144,6 +147,8 @@ class RefitCandidate:
     """Family-wise p-value: chance of so large a gain in any of the effects if none were missing."""
     epochs: int
     """Epochs of each training."""
+    stages: tuple[int, ...]
+    """The same by stage of the training, up to the one with the least held-out error."""
     plausible: bool
     """Whether the effect's parameters lay in their ranges after every training."""
     parameters: dict
@@ -341,6 +346,8 @@ class Job:
     """Epochs."""
     seed: int
     """Seed of the training."""
+    before: tuple[int, ...] = ()
+    """Epochs of the stages of training that led to the model."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,8 +358,8 @@ class Outcome:
     """The trained model."""
     losses: np.ndarray
     """(B, n) sum of squared distances of each block and key point, mm^2."""
-    epochs: int
-    """Epochs that it took."""
+    stages: tuple[int, ...]
+    """Epochs of each stage of training so far."""
 
 
 Rung = dict[str | None, list[Outcome]]
@@ -469,7 +476,7 @@ def run_job(split: Split, job: Job) -> Outcome:
     model = copy.deepcopy(job.model)
     hold = partial(_hold_plausible, effects=job.effects) if job.effects else None
     train_jointly(model, split.held(job.part), job.epochs, JointTraining(seed=job.seed), hold)
-    return Outcome(model, split.losses(model), job.epochs)
+    return Outcome(model, split.losses(model), (*job.before, job.epochs))
 
 
 def _hold_plausible(model: ArmModel, effects: Iterable[str]) -> None:
@@ -530,7 +537,8 @@ def refit(
             left[label] = str(error)
     tried = [label for label in sets if label in models]
     finalists = min(config.finalists, len(tried))
-    rungs = [(config.first_epochs, 1 + len(tried)), (config.epochs, 1 + finalists)]
+    first_epochs = config.early_epochs + config.first_epochs
+    rungs = [(first_epochs, 1 + len(tried)), (config.epochs, 1 + finalists)]
     work, done = config.seeds * sum(epochs * count for epochs, count in rungs), 0
     first: Rung = {}
     second: Rung = {}
@@ -541,7 +549,7 @@ def refit(
             pool = stack.enter_context(workers(processes, partial(_prepare, split)))
 
         def rung(labels: list[str], epochs: int, before: Rung) -> Rung:
-            """Trainings of the rival and of some candidates, one a seed, from the rung before."""
+            """Trainings of the rival and of some candidates, one a seed, from those before."""
             nonlocal done
             keys = [(label, part) for part in range(config.seeds) for label in (None, *labels)]
             jobs = [
@@ -551,6 +559,7 @@ def refit(
                     part,
                     epochs,
                     config.seed + part,
+                    before[label][part].stages if before else (),
                 )
                 for label, part in keys
             ]
@@ -563,12 +572,14 @@ def refit(
             return found
 
         if tried:
-            first = rung(tried, config.first_epochs, {})
+            early = rung(tried, config.early_epochs, {})
+            late = rung(tried, config.first_epochs, early)
+            first = {label: _better(split, early[label], late[label]) for label in late}
             scores = _scores(split, dict.fromkeys(tried, first), sets)
             order = sorted(tried, key=lambda label: -scores[label].log_gain)
             best = [label for label in order if scores[label].plausible][:finalists]
         if best:
-            second = rung(best, config.epochs, first)
+            second = rung(best, config.epochs, late)
             second = {label: _better(split, first[label], second[label]) for label in second}
         last = {label: second if label in best else first for label in tried}
         scores = _scores(split, last, sets) if tried else {}
@@ -582,7 +593,7 @@ def refit(
                     _without(outcome.model, problem.model, sets[winner]),
                     (),
                     part,
-                    outcome.epochs,
+                    outcome.stages[-1],
                     config.seed + part,
                 )
                 for part, outcome in enumerate(second[winner])
@@ -754,7 +765,8 @@ def _score(
         gain=float((before.sum() - after.sum()) / excess),
         log_gain=float(gain.mean()),
         p_value=chance,
-        epochs=rung[label][0].epochs,
+        epochs=sum(rung[label][0].stages),
+        stages=rung[label][0].stages,
         plausible=all(effect.plausible() for some in fitted for effect in some),
         parameters={q.name: q.value for effect in fitted[0] for q in effect.quantities()},
         in_words="; ".join(
@@ -856,8 +868,8 @@ def fit_together(
 ) -> JointFit:
     """Fit effects together with the network to all rows of a problem, and the network alone.
 
-    Both are trained for the epochs of both rungs of a refit. validated: the result of these effects
-    in that refit, whose held-out error becomes the new model's validated error. Effects that the
+    Both are trained in the stages after which a refit found the least held-out error. validated: the
+    result of these effects in that refit; its held-out error becomes the new model's validated one. Effects that the
     model has already are trained on in both.
     """
     effects = tuple(dict.fromkeys(effects))
@@ -871,7 +883,7 @@ def fit_together(
     for number, (note, start) in enumerate(starts_of.items()):
         held = tuple(name for name in effects if name in start.effects)
         progress(number, len(starts_of), f"fitted to all rows: {note}")
-        for epochs in (config.first_epochs, config.epochs):
+        for epochs in validated.stages:
             start = run_job(split, Job(start, held, None, epochs, config.seed)).model
         trained.append(start)
     validation = Validation(

@@ -30,7 +30,7 @@ from surgisoft.surrogate.checkpoint import save_model
 from surgisoft.surrogate.model import ArmModel, Validation
 
 PERIOD_S, LAG_S, NOISE_MM = 0.1, 0.4, 0.1
-SHORT = RefitConfig(rows=800, seeds=2, first_epochs=2, epochs=5, finalists=2)
+SHORT = RefitConfig(rows=800, seeds=2, early_epochs=1, first_epochs=2, epochs=5, finalists=2)
 """A budget of seconds."""
 
 
@@ -191,12 +191,13 @@ def test_the_rival_trains_on_the_same_rows_for_as_many_epochs(problem, monkeypat
     refit(problem, together=["line_lag"], config=SHORT)
     with_it = [rest for effects, *rest in done if effects]
     alone = [rest for effects, *rest in done if not effects]
-    assert len(with_it) == 2 * SHORT.seeds
+    assert len(with_it) == 3 * SHORT.seeds
     assert sorted(with_it) == sorted(alone[: len(with_it)])
     check = alone[len(with_it) :]  # the lag is named, so its network is trained on without it
     assert len(check) == SHORT.seeds
     assert all(any(each == other for other in with_it) for each in check)
-    assert {epochs for epochs, *_ in with_it} == {SHORT.first_epochs, SHORT.epochs}
+    stages = {SHORT.early_epochs, SHORT.first_epochs, SHORT.epochs}
+    assert {epochs for epochs, *_ in with_it} == stages
     assert all(held > 0 for *_, held in with_it)
 
 
@@ -219,7 +220,7 @@ def test_left_out_rows_are_no_part_of_a_training(problem, monkeypatch):
 
 
 def test_the_same_seed_gives_the_same_result_and_another_seed_another(problem):
-    brief = replace(SHORT, first_epochs=1, epochs=1)
+    brief = replace(SHORT, early_epochs=1, first_epochs=1, epochs=1)
     first, again, other = (
         refit(problem, together=["line_lag"], config=replace(brief, seed=seed))
         for seed in (0, 0, 1)

@@ -82,7 +82,8 @@ def candidate(name: str, **fields) -> RefitCandidate:
     values = {
         "effect": name, "heldout_rmse_mm": 0.2, "per_key_point_mm": (0.2,), "seeds_mm": (0.2,),
         "rival_mm": 0.5, "difference_mm": 0.3, "ci95_mm": (0.2, 0.4), "spread_mm": 0.1,
-        "gain": 0.9, "log_gain": 0.9, "p_value": 0.001, "epochs": 5, "plausible": True,
+        "gain": 0.9, "log_gain": 0.9, "p_value": 0.001, "epochs": 5,
+        "stages": (5,), "plausible": True,
         "parameters": {},
     }  # fmt: skip
     return RefitCandidate(**(values | fields))

@@ -3,12 +3,14 @@
     python -m benchmarks.gpu [--tasks track_circle,circle_ablation] [--envs 4096,65536]
     python -m benchmarks.gpu --compile
     python -m benchmarks.gpu --agree all
+    python -m benchmarks.gpu --preset robust --arm FOLDER
 
-With --agree a table of the largest differences between episodes stepped as CUDA graphs and the same
-ones on the CPU, with the same random actions and resets: key points and clearance, mm, the beam's
-end, mm, how many beams meet another thing, lines of sight that differ, and dose, as a share of
-the largest. Otherwise steps per second on the clock, with random actions and all resets, and of
-whole iterations of PPO; a step of the world and its parts in milliseconds.
+--preset: a preset of `surgisoft train`, with the world that it trains in. --arm: a model for every
+arm of a task. With --agree a table of the largest differences between episodes stepped as CUDA
+graphs and the same ones on the CPU, with the same random actions and resets: key points and
+clearance, mm, the beam's end, mm, how many beams meet another thing, lines of sight that differ,
+and dose, as a share of the largest. Otherwise steps per second on the clock, with random actions
+and all resets, and of whole iterations of PPO; a step of the world and its parts in milliseconds.
 """
 
 from __future__ import annotations
@@ -17,6 +19,8 @@ import argparse
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,6 +28,7 @@ from torch import Tensor
 from benchmarks.control.policies import plan_of
 from surgisoft.agents.compiled_update import compile_arms
 from surgisoft.agents.distributed import Processes
+from surgisoft.agents.presets import PRESETS, Plan, config_for
 from surgisoft.agents.training import Training
 from surgisoft.tasks.base import Episodes, TaskState
 from surgisoft.tasks.batched import BatchedEnv
@@ -38,9 +43,9 @@ ITERATIONS = 5
 """Iterations of PPO that are timed, after the first one, which records the graphs."""
 
 
-def differences(name: str, device: torch.device) -> dict[str, float]:
+def differences(name: str, device: torch.device, config: Any = None) -> dict[str, float]:
     """Largest differences of a task's episodes on a device from those on the CPU."""
-    there, here = make_task(name, device=device), make_task(name)
+    there, here = make_task(name, config, device), make_task(name, config)
     play, truth = GraphedEpisodes(there, EPISODES), Episodes(here, donate=True)
     draw = torch.Generator().manual_seed(0)
     found: dict[str, float] = {}
@@ -99,10 +104,10 @@ def rate(work: Callable[[], object]) -> float:
     return calls / (time.perf_counter() - begin)
 
 
-def world(name: str, envs: int, device: torch.device, compiles: bool) -> tuple[float, float, float]:
+def world(plan: Plan, device: torch.device) -> tuple[float, float, float]:
     """Steps of the world per second with resets and observations; ms of a step, of observing."""
-    task = make_task(name, device=device)
-    if compiles:
+    task, envs = make_task(plan.task, plan.task_config, device), plan.preset.envs
+    if plan.preset.compile:
         compile_arms(task.world, envs)
     env = BatchedEnv(task, envs, 0, spread=True)
     actions = {
@@ -119,19 +124,17 @@ def world(name: str, envs: int, device: torch.device, compiles: bool) -> tuple[f
     )
 
 
-def ppo(name: str, envs: int, device: torch.device, compiles: bool) -> tuple[float, float]:
+def ppo(plan: Plan, device: torch.device) -> tuple[float, float]:
     """Steps of training per second, and seconds until the first iteration is done."""
-    plan = plan_of(name, 1)
-    plan = replace(plan, preset=replace(plan.preset, envs=envs, compile=compiles))
     begin = time.perf_counter()
-    training = Training(plan, make_task(name, plan.task_config, device), Processes())
+    training = Training(plan, make_task(plan.task, plan.task_config, device), Processes())
     training.iterate()
     torch.cuda.synchronize()
     first, begin = time.perf_counter() - begin, time.perf_counter()
     for _ in range(ITERATIONS):
         training.iterate()
     torch.cuda.synchronize()
-    steps = ITERATIONS * envs * plan.preset.rollout
+    steps = ITERATIONS * plan.preset.envs * plan.preset.rollout
     return steps / (time.perf_counter() - begin), first
 
 
@@ -141,18 +144,25 @@ def main() -> None:
     parser.add_argument("--tasks", default="track_circle,circle_ablation")
     parser.add_argument("--envs", default="4096,16384,65536")
     parser.add_argument("--agree", default="")
+    parser.add_argument("--preset", default="fast", choices=PRESETS)
+    parser.add_argument("--arm", type=Path, help="folder of a model, for every arm")
     parser.add_argument("--compile", action="store_true", help="the arms by torch.compile, too")
     chosen = parser.parse_args()
     if not torch.cuda.is_available():
         parser.error("PyTorch finds no NVIDIA GPU here; run it on a machine that has one")
     device = torch.device("cuda")
+
+    def planned(name: str) -> Plan:
+        plan = plan_of(name, 1, arm=chosen.arm, preset=chosen.preset)
+        return replace(plan, task_config=config_for(chosen.preset, plan.task_config))
+
     print(f"{torch.cuda.get_device_name()}, PyTorch {torch.__version__}")
     if chosen.agree:
         names = list(TASKS) if chosen.agree == "all" else chosen.agree.split(",")
         print("| task | largest differences from the CPU |")
         print("|---|---|")
         for name in names:
-            found = differences(name, device)
+            found = differences(name, device, planned(name).task_config)
             print(f"| {name} | " + ", ".join(f"{k} {v:.1e}" for k, v in found.items()) + " |")
         return
     print("| task | envs | world, steps/s | step ms | observe ms | PPO, steps/s | first s | GiB |")
@@ -160,8 +170,10 @@ def main() -> None:
     for name in chosen.tasks.split(","):
         for envs in (int(count) for count in chosen.envs.split(",")):
             torch.cuda.reset_peak_memory_stats()
-            steps, step, observe = world(name, envs, device, chosen.compile)
-            trained, first = ppo(name, envs, device, chosen.compile)
+            plan = planned(name)
+            plan = replace(plan, preset=replace(plan.preset, envs=envs, compile=chosen.compile))
+            steps, step, observe = world(plan, device)
+            trained, first = ppo(plan, device)
             memory = torch.cuda.max_memory_allocated() / 2**30
             cells = [f"{steps:,.0f}", f"{step:.2f}", f"{observe:.2f}", f"{trained:,.0f}"]
             row = [name, f"{envs:,}", *cells, f"{first:.1f}", f"{memory:.1f}"]

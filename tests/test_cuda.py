@@ -4,14 +4,17 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import nn
 
 from benchmarks.gpu import differences
 from surgisoft.agents.distributed import Processes
-from surgisoft.agents.presets import Plan, preset_for
+from surgisoft.agents.presets import ROBUST, Plan, config_for, preset_for
 from surgisoft.agents.training import Training
 from surgisoft.cuda_graph import cuda_graph, recorded
 from surgisoft.errors import AssumptionWarning
-from surgisoft.tasks.registry import TASKS, config_of, make_task
+from surgisoft.surrogate.checkpoint import default_arm, save_model
+from surgisoft.surrogate.networks import ArcChain
+from surgisoft.tasks.registry import TASKS, config_of, make_task, with_fields
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="PyTorch finds no NVIDIA GPU")
 MOST = {
@@ -27,9 +30,30 @@ times what its arm does."""
 
 
 @pytest.mark.filterwarnings("error::surgisoft.errors.AssumptionWarning")
-@pytest.mark.parametrize("name", TASKS)
-def test_episodes_on_a_gpu_are_those_of_the_cpu(name):
-    found = differences(name, torch.device("cuda"))
+@pytest.mark.parametrize(
+    ("name", "preset"),
+    [*((name, "fast") for name in TASKS), ("track_circle", ROBUST), ("circle_ablation", ROBUST)],
+)
+def test_episodes_on_a_gpu_are_those_of_the_cpu(name, preset):
+    agree(name, config_for(preset, config_of(name)))
+
+
+@pytest.mark.filterwarnings("error::surgisoft.errors.AssumptionWarning")
+def test_an_arm_with_a_prior_mean_steps_in_a_graph(tmp_path):
+    model = default_arm()
+    prior = ArcChain(
+        torch.tensor(model.spec.low), torch.tensor(model.spec.high), model.spec.key_points, 4
+    )
+    prior.set_rest(model.rest_mm)
+    nn.init.normal_(prior.table, std=0.1)
+    model.network.prior, model.network.arcs = prior, 4
+    save_model(model, tmp_path / "arm")
+    agree("track_circle", with_fields(config_of("track_circle"), arm=str(tmp_path / "arm")))
+
+
+def agree(name, config):
+    """Episodes on a GPU are those of the CPU but for rounding."""
+    found = differences(name, torch.device("cuda"), config)
     assert found["key points mm"] > 0.0  # another processor rounds in another way
     for what, size in found.items():
         assert size <= MOST[what], what

@@ -63,7 +63,7 @@ class GraphedRollout:
         overwrite(self._seen.to_dict(), seen.to_dict())
         for k in range(self.steps):
             self._step = self._done("step", self._stepped)
-            self._done(f"storage {k}", functools.partial(self._stored, k))
+            self._store(k)
             env.state = self._episodes.reset(env.state, self._step[1])
             self._done("observation", self._observed)
         means = self._done("returns", self._ended).tolist()
@@ -80,6 +80,14 @@ class GraphedRollout:
             self._transitions[agent] = copy.copy(ppo.transition)
         outcome = self._episodes.advanced(asked).views()
         return outcome.rewards, outcome.done, outcome.truncated, notes_of(outcome)
+
+    def _store(self, k: int) -> None:
+        """Put the step in the storages: by a graph, if the results of a step have fixed places."""
+        work = functools.partial(self._stored, k)
+        if self._work["step"] == self._stepped:  # no graph could be made of it
+            work()
+        else:
+            self._done(f"storage {k}", work)
 
     def _stored(self, k: int) -> None:
         """Put the step in the agents' storages as number k."""

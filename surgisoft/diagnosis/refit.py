@@ -868,9 +868,9 @@ def fit_together(
 ) -> JointFit:
     """Fit effects together with the network to all rows of a problem, and the network alone.
 
-    Both are trained in the stages after which a refit found the least held-out error. validated: the
-    result of these effects in that refit; its held-out error becomes the new model's validated one. Effects that the
-    model has already are trained on in both.
+    Both are trained in the stages after which a refit found the least held-out error. validated:
+    the result of these effects in that refit; its held-out error becomes the new model's validated
+    one. Effects that the model has already are trained on in both.
     """
     effects = tuple(dict.fromkeys(effects))
     check_trainable(problem.model, effects)

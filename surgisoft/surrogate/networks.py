@@ -235,7 +235,8 @@ def rotation(vector: Tensor) -> Tensor:
     angle = (vector.square().sum(-1) + 1e-12).sqrt()[..., None, None]
     along = torch.sinc(angle / math.pi)
     across = 0.5 * torch.sinc(angle / (2 * math.pi)).square()
-    return torch.eye(3).to(cross) + along * cross + across * (cross @ cross)
+    unturned = torch.eye(3, dtype=cross.dtype, device=cross.device)
+    return unturned + along * cross + across * (cross @ cross)
 
 
 def arc_point(bend: Tensor, length: Tensor) -> Tensor:

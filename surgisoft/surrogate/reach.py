@@ -69,7 +69,9 @@ def steady_key_points(model: ArmModel, actuation: np.ndarray) -> np.ndarray:
             f"the model has {model.spec.chambers} chambers, got {np.shape(actuation)[-1]}"
         )
     with torch.no_grad():
-        pressure = torch.as_tensor(np.asarray(actuation), dtype=torch.float32)
+        pressure = torch.as_tensor(
+            np.asarray(actuation), dtype=torch.float32, device=model.rest_mm.device
+        )
         state = model.initial_state(len(pressure), pressure)
         _, points = model.step(state, torch.zeros_like(pressure), 1.0)
-    return points.double().numpy()
+    return points.double().cpu().numpy()

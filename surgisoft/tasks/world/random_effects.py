@@ -99,7 +99,8 @@ class RandomEffects:
         factors = torch.zeros_like(parts)
         chosen = kind.long().clamp(max=len(self.kinds) - 1)
         for number, (name, names) in enumerate(zip(KINDS, self.kinds, strict=True)):
-            places = [self.names.index(each) for each in names]
+            first = self.names.index(names[0])
+            places = slice(first, first + len(names))  # no list, which a GPU would have to be sent
             part = parts[:, places]
             share = part / part.norm(dim=1, keepdim=True).clamp(min=1e-6)
             share = share if name in BOTH_SIGNS else share.abs()

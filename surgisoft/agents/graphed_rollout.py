@@ -51,7 +51,8 @@ class GraphedRollout:
         self._seen = env.get_observations()
         self._views = {agent: self._seen.select(*groups[agent]) for agent in agents}
         self._work: dict[str, Callable[[], Any]] = {}
-        self._step: tuple[dict[str, Tensor], Tensor, Tensor, dict[str, Tensor]]
+        self.latest: tuple[dict[str, Tensor], Tensor, Tensor, dict[str, Tensor]] | None = None
+        """Results of the last step, see `stepped`."""
         self._transitions: dict[str, Any] = {}
         self._notes: Tensor | None = None
 
@@ -62,17 +63,15 @@ class GraphedRollout:
         env.state = self._episodes.held(env.state)
         overwrite(self._seen.to_dict(), seen.to_dict())
         for k in range(self.steps):
-            self._step = self._done("step", self._stepped)
+            self.latest = latest = self._done("step", self.stepped)
             self._store(k)
-            env.state = self._episodes.reset(env.state, self._step[1])
+            env.state = self._episodes.reset(env.state, latest[1])
             self._done("observation", self._observed)
         means = self._done("returns", self._ended).tolist()
         rows = self.steps * env.num_envs
-        return self._seen.clone(), RolloutMeans.of(
-            dict(zip(self._step[3], means, strict=True)), rows
-        )
+        return self._seen.clone(), RolloutMeans.of(dict(zip(latest[3], means, strict=True)), rows)
 
-    def _stepped(self) -> tuple[dict[str, Tensor], Tensor, Tensor, dict[str, Tensor]]:
+    def stepped(self) -> tuple[dict[str, Tensor], Tensor, Tensor, dict[str, Tensor]]:
         """Act and step: rewards by agent, dones, time-outs, and everything by its name."""
         asked = {}
         for agent, ppo in self.agents.items():
@@ -84,14 +83,15 @@ class GraphedRollout:
     def _store(self, k: int) -> None:
         """Put the step in the storages: by a graph, if the results of a step have fixed places."""
         work = functools.partial(self._stored, k)
-        if self._work["step"] == self._stepped:  # no graph could be made of it
+        if self._work["step"] == self.stepped:  # no graph could be made of it
             work()
         else:
             self._done(f"storage {k}", work)
 
     def _stored(self, k: int) -> None:
         """Put the step in the agents' storages as number k."""
-        rewards, done, late, notes = self._step
+        assert self.latest is not None
+        rewards, done, late, notes = self.latest
         for agent, ppo in self.agents.items():
             ppo.transition, ppo.storage.step = copy.copy(self._transitions[agent]), k
             ppo.process_env_step(self._views[agent], rewards[agent], done, {"time_outs": late})

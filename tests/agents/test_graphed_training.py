@@ -92,13 +92,13 @@ def test_a_recorded_rollout_stores_what_a_plain_one_does(name, refused, monkeypa
 
     def record(work):
         """As a graph, its replays read a step where it was when they were recorded."""
-        if refused and work == roll._stepped:
+        if refused and work == roll.stepped:
             raise RuntimeError("a value was read")
-        again, step = replays(work), getattr(roll, "_step", None)
+        again, step = replays(work), roll.latest
 
         def replay():
-            if work != roll._stepped:
-                roll._step = step
+            if work != roll.stepped:
+                roll.latest = step
             return again()
 
         return replay

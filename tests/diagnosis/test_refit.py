@@ -201,6 +201,29 @@ def test_the_rival_trains_on_the_same_rows_for_as_many_epochs(problem, monkeypat
     assert all(held > 0 for *_, held in with_it)
 
 
+def test_the_stage_with_the_least_held_out_error_counts_and_is_what_is_trained(
+    problem, monkeypatch
+):
+    """Training on makes every network worse here, from the second stage on."""
+    train, done = refitting.train_jointly, []
+
+    def spoiled(model, data, epochs, config, hold=None):
+        done.append(epochs)
+        if epochs == SHORT.early_epochs:
+            train(model, data, epochs, config, hold)
+        else:
+            model.network.mean.add_(5.0)
+
+    monkeypatch.setattr(refitting, "train_jointly", spoiled)
+    (lag,) = refit(problem, together=["line_lag"], config=SHORT).candidates
+    assert lag.stages == (SHORT.early_epochs,)
+    assert lag.epochs == SHORT.early_epochs
+    done.clear()
+    fit_together(problem, ["line_lag"], lag, SHORT)
+    fit_together(problem, ["line_lag"], replace(lag, stages=(1, 2)), SHORT)
+    assert done == [1, 1, 1, 2, 1, 2]  # with the lag, and the network alone
+
+
 def test_left_out_rows_are_no_part_of_a_training(problem, monkeypatch):
     """Training targets and held-out rows have no row in common, and all rows are left out once."""
     seen = []

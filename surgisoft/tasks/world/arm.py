@@ -367,6 +367,9 @@ class ModelArm:
         """This arm stepped by differentiable tensor operations alone, which agree to rounding."""
         arm = copy.copy(self)
         arm._compiled = None
+        if arm._learner is not None:
+            arm._learner = copy.copy(arm._learner)
+            arm._learner.compiles = False
         return arm
 
     @property

@@ -47,7 +47,7 @@ from surgisoft.diagnosis.inputs import (
 )
 from surgisoft.diagnosis.other_models import open_model
 from surgisoft.diagnosis.pairs import BeforeAfter, Change, ChangeTrack, Paired, before_and_after
-from surgisoft.diagnosis.refit import Refit, can_hide, refit_reason
+from surgisoft.diagnosis.refit import LINE_OR_WALL, WALL_LAG, Refit, can_hide, refit_reason
 from surgisoft.diagnosis.refit import refit as fit_candidates_together
 from surgisoft.diagnosis.residuals import Problem, Sealed, residual_table
 from surgisoft.diagnosis.selection import (
@@ -481,6 +481,8 @@ def with_refit(result: Diagnosis, joint: Refit, problem: Problem) -> Diagnosis:
         )
         ranking = tuple(_as_fitted(row, joint) if row.effect in effects else row for row in ranking)
         competing, plan = joint.competing, None
+        if joint.winner == WALL_LAG and problem.model.spec.actuation == "measured":
+            checks = (*checks, LINE_OR_WALL)
         if kind == "ambiguous":
             plan = recommend(problem, effects[:MOST_RIVALS]).experiment
         if chances is not None:

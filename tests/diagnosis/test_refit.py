@@ -330,6 +330,19 @@ def test_effects_that_a_refit_cannot_decide_are_not_tried(problem, found):
     assert "steady-state" in left["line_lag"]
 
 
+def test_a_lag_of_the_wall_is_said_to_be_possibly_one_of_the_line(problem, found):
+    """Where the line was not tried, since the actuation counts as measured."""
+    wall = replace(found.of("line_lag"), effect="rate_dependence")
+    alone = replace(found, candidates=(wall,), winner="rate_dependence", competing=())
+    model = problem.model.replace(spec=replace(problem.model.spec, actuation="measured"))
+    told = [
+        with_refit(named("creep", alone), alone, posed).checks
+        for posed in (replace(problem, model=model), problem)
+    ]
+    assert any("--actuation commanded" in check for check in told[0])
+    assert told[1] == ()
+
+
 def named(effect: str | None, found) -> Diagnosis:
     """A diagnosis of the residuals that names an effect."""
     row = Ranked("creep", 0.9, 0.5, 0.5, 1.0, (0.9, 1.1), 0.01, 0.3, {})

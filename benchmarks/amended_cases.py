@@ -29,10 +29,10 @@ import numpy as np
 import torch
 
 from benchmarks import chain_cases, elastica_cases
-from benchmarks.decision.evidence_log import EVIDENCE, JUDGED, Labelled, stored
+from benchmarks.decision.evidence_log import EVIDENCE, JUDGED, Labelled, in_order, stored
 from benchmarks.decision.fit import NAMING, fit, model_of
 from benchmarks.decision.folders import model_folder, robot_folder
-from benchmarks.decision.table import Judged, judged
+from benchmarks.decision.table import Judged, default_models, judged
 from benchmarks.diagnosis.after_table import SHOWS
 from benchmarks.diagnosis.amend import Amended, amended
 from benchmarks.rig_cases import TAKES, Generator, after_protocol
@@ -71,12 +71,13 @@ def statements(source: str) -> list[Judged]:
     aside = stored(EVIDENCE / JUDGED)
     if source in aside:
         return judged(aside[source], fitted_decision())
-    every = stored()
-    if source not in every:
-        names = ", ".join((*aside, *every))
-        raise InputError(f"{source}: no stored evidence of that name; there is {names}")
-    others = [case for name, some in every.items() if name != source for case in some]
-    return judged(every[source], model_of(fit(others)))
+    every = in_order([case for some in stored().values() for case in some])
+    names = sorted({case.source for case in every})
+    if source not in names:
+        known = ", ".join((*aside, *names))
+        raise InputError(f"{source}: no stored evidence of that name; there is {known}")
+    own = default_models([case for case in every if case.source == source])
+    return judged(own, model_of(fit([case for case in every if case.source != source])))
 
 
 def to_amend(some: Sequence[Judged], effects: int) -> list[tuple[Labelled, str, tuple[str, ...]]]:
@@ -137,7 +138,7 @@ def _opened(
     """The model of a case's robot, its recording, and the same with nothing hidden."""
     place = folder / case.case
     after = json.loads((place / "truth.json").read_text())["after"]
-    model = load_model(model_folder(folder, case.robot, models))
+    model = load_model(model_folder(folder, case.robot, models, models=case.models))
     recording = load_recordings(place / "after")[0]
     return model, recording, unchanged(generator, case, after)
 

@@ -5,7 +5,7 @@ import datetime
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -215,6 +215,12 @@ def decision(
             help="Stored sources that no fit uses otherwise, to be fitted to as well.",
         ),
     ] = None,
+    models: Annotated[
+        Literal["default", "alone"],
+        typer.Option(
+            help="Models that --cases and --judge ask: those of fit by default, or networks alone."
+        ),
+    ] = "default",
     robots: Robots = "200,201,202,203,204,205",
     undertrained: Annotated[
         str, typer.Option(help="Robots among them that also get an undertrained model.")
@@ -258,7 +264,7 @@ def decision(
         )
     plan = own_rig.Plan(_numbers("--robots", robots), _numbers("--undertrained", undertrained))
     with _kept("decision", work) as report:
-        new = Collected(plan, count, seed, cases or [], judge or [], include or [])
+        new = Collected(plan, count, seed, cases or [], judge or [], include or [], models)
         some, aside, values = run(new, work, processes, report, keeps=keep)
     if asset:
         write_atomically(asset, json.dumps(values, indent=1) + "\n")

@@ -44,6 +44,11 @@ Label = Literal["known", "unknown", "clean", "network", "other_robot", "setup"]
 network is undertrained; the model is that of another robot; the set-up is wrong."""
 
 
+Models = Literal["default", "alone"]
+"""Models that a case is asked of: those of `fit` by default, with a prior mean where it does no
+harm; or networks alone (`--prior none`)."""
+
+
 @dataclass(frozen=True)
 class Labelled:
     """The evidence of a case, and what is true of it."""
@@ -78,6 +83,8 @@ class Labelled:
     left_out: tuple[str, ...] = ()
     """Missing effects that were no candidates (`without_truth`): of such a diagnosis the truth is
     unknown, though it is in the list."""
+    models: Models = "alone"
+    """The model that was asked; that of stored evidence that does not say so is a network alone."""
 
     @property
     def size(self) -> float:
@@ -85,8 +92,11 @@ class Labelled:
         return 9.0 if self.effect_mm is None else self.effect_mm / max(self.validated_mm, 1e-9)
 
     def to_json(self) -> dict:
-        """Plain values, numbers with DIGITS significant digits."""
-        return _rounded(json_safe(asdict(self) | {"evidence": self.evidence.to_json()}))
+        """Plain values, numbers with DIGITS significant digits; no `models` where it is alone."""
+        plain = asdict(self) | {"evidence": self.evidence.to_json()}
+        if self.models == "alone":
+            del plain["models"]
+        return _rounded(json_safe(plain))
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "Labelled":
@@ -198,8 +208,18 @@ def read(path: Path) -> list[Labelled]:
     return list(answer.values())
 
 
+def file_of(source: str, models: Models) -> str:
+    """Name of the file of a source's evidence, without its end."""
+    return source if models == "alone" else f"{source}.{models}"
+
+
+def in_order(some: Sequence[Labelled]) -> list[Labelled]:
+    """Cases in an order that does not depend on how they were collected or stored."""
+    return sorted(some, key=lambda one: (one.source, one.case, one.models))
+
+
 def stored(folder: Path = EVIDENCE) -> dict[str, list[Labelled]]:
-    """The cases of each source of a folder of stored evidence."""
+    """The cases of each file of a folder of stored evidence, by its name (`file_of`)."""
     files = sorted(folder.glob(f"*{ENDING}"))
     return {file.name.removesuffix(ENDING): read(file) for file in files}
 

@@ -24,6 +24,7 @@ import torch
 from benchmarks.decision.evidence_log import (
     Label,
     Labelled,
+    Models,
     append,
     is_stored,
     posed_on,
@@ -42,8 +43,8 @@ from surgisoft.workers import workers
 FIT_EFFECTS = ("hysteresis",)
 """Effects that a model of a source without models of its own is fitted with, as the robots of the
 benchmark `diagnosis` are."""
-FIT_PRIOR = "none"
-"""Its prior mean: that of the models from which evidence is stored."""
+PRIOR: dict[Models, str | None] = {"default": None, "alone": "none"}
+"""Prior mean of the models that are asked."""
 FEW_EPOCHS = 10
 """Epochs of a model that is undertrained, as those of the own rig are."""
 OTHER = "unknown"
@@ -58,29 +59,40 @@ def robot_folder(folder: Path, robot: str) -> Path:
     raise InputError(f"{folder}: no recordings before the change of robot '{robot}'")
 
 
-def model_folder(folder: Path, robot: str, work: Path, undertrained: bool = False) -> Path:
-    """The fitted model of a robot; it is fitted at the first call."""
+def model_folder(
+    folder: Path, robot: str, work: Path, undertrained: bool = False, models: Models = "default"
+) -> Path:
+    """The fitted model of a robot; it is fitted at the first call.
+
+    A model that the cases were made with, a network alone, is taken where networks alone are asked.
+    """
     place = robot_folder(folder, robot)
-    if (place / "model" / "config.json").is_file() and not undertrained:
+    if (place / "model" / "config.json").is_file() and not undertrained and models == "alone":
         return place / "model"
-    own = work / f"{folder.name}-{robot}{'-undertrained' if undertrained else ''}"
+    own = work / f"{folder.name}-{robot}-{models}{'-undertrained' if undertrained else ''}"
     if not (own / "config.json").is_file():
         about = place / "robot.json"
         budget = json.loads(about.read_text()).get("fit", {}) if about.is_file() else {}
         few = {"epochs": FEW_EPOCHS} if undertrained else {}
-        result = fit(place / "before", effects=FIT_EFFECTS, prior=FIT_PRIOR, **budget | few)
+        how = {"effects": FIT_EFFECTS} | budget | few
+        result = fit(place / "before", prior=PRIOR[models], **how)
         own.parent.mkdir(parents=True, exist_ok=True)
         save_model(result.model, own, result.report(), force=True, known=result.known)
     return own
 
 
 def run_case(
-    source: str, folder: Path, truth_file: Path, work: Path, twin: bool = False
+    source: str,
+    folder: Path,
+    truth_file: Path,
+    work: Path,
+    twin: bool = False,
+    models: Models = "default",
 ) -> list[Labelled]:
     """The evidence of one case; twin: and of it without its truth among the candidates."""
     torch.set_num_threads(1)
     truth = json.loads(truth_file.read_text())
-    model = load_model(model_folder(folder, truth["robot"], work))
+    model = load_model(model_folder(folder, truth["robot"], work, models=models))
     recordings = load_recordings(truth_file.parent / "after")
     before = load_recordings(robot_folder(folder, truth["robot"]) / "before")
     begin = time.process_time()
@@ -107,6 +119,7 @@ def run_case(
         evidence=evidence,
         seconds=seconds,
         complete=bool(truth.get("same_rows", True)),
+        models=models,
     )
     left_out = without_truth(one, posed) if twin else None
     return [one] if left_out is None else [one, left_out]
@@ -119,7 +132,8 @@ def run_off(source: str, folder: Path, clean: Labelled, asked: str | None, work:
     """
     torch.set_num_threads(1)
     robot = asked or clean.robot
-    model = load_model(model_folder(folder, robot, work, undertrained=asked is None))
+    asked_of = model_folder(folder, robot, work, undertrained=asked is None, models=clean.models)
+    model = load_model(asked_of)
     recordings = load_recordings(folder / clean.case / "after")
     begin = time.process_time()
     evidence = posed_on(model, recordings).evidence()
@@ -144,9 +158,9 @@ def models_that_are_off(folder: Path, done: list[Labelled], work: Path) -> list[
         if first is None:
             continue
         answer.append((first, None))
-        own = load_model(model_folder(folder, robot, work)).spec
+        own = load_model(model_folder(folder, robot, work, models=first.models)).spec
         for other in [one for one in robots if one != robot]:
-            spec = load_model(model_folder(folder, other, work)).spec
+            spec = load_model(model_folder(folder, other, work, models=first.models)).spec
             if (spec.chambers, spec.key_points) == (own.chambers, own.key_points):
                 answer.append((first, other))
                 break
@@ -162,6 +176,7 @@ def run(
     report: Progress,
     off: bool = True,
     twins: bool = False,
+    models: Models = "default",
 ) -> list[Labelled]:
     """Collect the evidence of all cases of a folder; those that the log has are not repeated.
 
@@ -173,10 +188,14 @@ def run(
     names = {path: str(path.parent.relative_to(folder)) for path in files}
     robots = sorted({json.loads(path.read_text())["robot"] for path in files})
     with workers(processes) as pool:
-        for job in [pool.submit(model_folder, folder, robot, work) for robot in robots]:
+        for job in [
+            pool.submit(model_folder, folder, robot, work, models=models) for robot in robots
+        ]:
             job.result()
         missing = [path for path in files if not is_stored(done, names[path], twins)]
-        jobs = [pool.submit(run_case, source, folder, path, work, twins) for path in missing]
+        jobs = [
+            pool.submit(run_case, source, folder, path, work, twins, models) for path in missing
+        ]
         for number, job in enumerate(as_completed(jobs)):
             some = job.result()
             append(log, *some)

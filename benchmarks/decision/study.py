@@ -5,7 +5,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.decision import folders, own_rig
-from benchmarks.decision.evidence_log import EVIDENCE, JUDGED, Labelled, keep, read, stored
+from benchmarks.decision.evidence_log import (
+    EVIDENCE,
+    JUDGED,
+    Labelled,
+    Models,
+    file_of,
+    in_order,
+    keep,
+    read,
+    stored,
+)
 from benchmarks.decision.fit import fit
 from surgisoft.errors import InputError
 from surgisoft.progress import Progress
@@ -27,6 +37,8 @@ class Collected:
     """The same, of cases that take no part in any fit."""
     included: Sequence[str] = ()
     """Names of stored sources that otherwise take no part, and are fitted to here."""
+    models: Models = "default"
+    """Models that the cases of other sources than the own rig are asked of."""
 
     @property
     def command(self) -> str:
@@ -40,6 +52,7 @@ class Collected:
             words.append(f"--count {self.count} --seed {self.seed}")
         for option, given in (("--cases", self.sources), ("--judge", self.judged)):
             words += [f"{option} {name}={folder.name}" for name, folder in map(_source, given)]
+        words += ["--models alone"] * (self.models == "alone")
         words += [f"--include {name}" for name in self.included]
         return " ".join(words)
 
@@ -66,10 +79,9 @@ def run(
         every[own_rig.SOURCE] = read(own)  # with those of other seeds
     for target, given, fitted in ((every, new.sources, True), (aside, new.judged, False)):
         for name, folder in map(_source, given):
-            log = logs / f"{name}.jsonl"
-            target[name] = folders.run(
-                name, folder, work / "models", log, processes, report, off=fitted, twins=fitted
-            )
+            file = file_of(name, new.models)
+            log, asked = logs / f"{file}.jsonl", (processes, report, fitted, fitted, new.models)
+            target[file] = folders.run(name, folder, work / "models", log, *asked)
     for name in new.included:
         if name not in aside:
             known = ", ".join(sorted(aside)) or "none"
@@ -87,8 +99,7 @@ def run(
 
 def _ordered(sources: dict[str, list[Labelled]]) -> list[Labelled]:
     """All cases as they are stored, in an order that does not depend on how they were collected."""
-    some = [Labelled.from_json(one.to_json()) for own in sources.values() for one in own]
-    return sorted(some, key=lambda one: (one.source, one.case))
+    return in_order([Labelled.from_json(o.to_json()) for own in sources.values() for o in own])
 
 
 def _source(given: str) -> tuple[str, Path]:

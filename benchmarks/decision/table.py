@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from benchmarks.decision.evidence_log import Labelled
+from benchmarks.decision.evidence_log import Labelled, in_order
 from benchmarks.decision.fit import (
     NAMING,
     OFF,
@@ -90,14 +90,26 @@ def left_out(
     }
 
 
-def robots_left_out(cases: Sequence[Labelled]) -> list[Judged]:
-    """Each robot judged by a decision that was fitted to all other robots of all sources."""
+def robots_left_out(cases: Sequence[Labelled], alone: Sequence[Labelled] = ()) -> list[Judged]:
+    """Each robot judged by a decision that was fitted to all other robots of all sources.
+
+    alone: cases that take part in fits and are not judged.
+    """
     answer = []
     for source, robot in sorted({(case.source, case.robot) for case in cases}):
         own = [case for case in cases if (case.source, case.robot) == (source, robot)]
-        others = [case for case in cases if (case.source, case.robot) != (source, robot)]
-        answer += judged(own, model_of(fit(others)))
+        others = [case for case in (*cases, *alone) if (case.source, case.robot) != (source, robot)]
+        answer += judged(own, model_of(fit(in_order(others))))
     return answer
+
+
+def default_models(cases: Sequence[Labelled], default: bool = True) -> list[Labelled]:
+    """The cases of default models, and of sources that have none; or, without default, the others:
+    of networks alone in sources that have both."""
+    both = {case.source for case in cases if case.models == "default"}
+    return [
+        case for case in cases if (case.models == "default" or case.source not in both) == default
+    ]
 
 
 def rate(hits: Sequence[bool]) -> str:
@@ -436,11 +448,14 @@ def markdown(
     aside: cases that took no part in any fit; each_robot: whether each robot is left out, too,
     which takes one fit for each of them.
     """
-    models = fits_without(cases)
+    models, alone = fits_without(cases), default_models(cases, default=False)
+    cases = default_models(cases)
     by_source = left_out(cases, models)
     together = [one for some in by_source.values() for one in some]
     columns = by_source | ({"together": together} if len(by_source) > 1 else {})
     parts = ["## Cases", sources([*cases, *aside])]
+    if alone:
+        parts += ["### The same with networks alone, which the fit has, too", sources(alone)]
     if columns:
         parts += ["## Each source left out of the fit", goals(columns)]
         parts += ["### Results by true effect", kinds(together)]
@@ -448,6 +463,10 @@ def markdown(
         parts += ["### Wrong names with a confidence of 0.8 or more", serious(together)]
         if any(case.left_out for case in cases):
             parts += ["### Known effects that were no candidates", neighbours(together)]
+        if alone:
+            some = {name: own for name, own in left_out(alone, models).items() if own}
+            columns = some | {"together": [one for own in some.values() for one in own]}
+            parts += ["### The same cases with networks alone", goals(columns)]
         parts += ["### Costs chosen", chosen_costs(models)]
         parts += ["### More or fewer names", trade_off(cases, models)]
     if aside:
@@ -461,7 +480,7 @@ def markdown(
         for name, some in new.items():
             parts += [f"### Results by true effect, {name}", kinds(some)]
     if each_robot:
-        inside = robots_left_out(cases)
+        inside = robots_left_out(cases, alone)
         parts += ["## Each robot left out of the fit", goals({"all sources": inside})]
         parts += ["### Results by true effect, robots left out", kinds(inside)]
     parts += ["## The fitted weights", weights(values), curves(values)]

@@ -29,8 +29,8 @@ from surgisoft.progress import Progress, Stages
 from surgisoft.surrogate.checkpoint import save_model
 
 MODEL = FitOptions(prior="none")
-"""Options of the fit of the model that a diagnosis is asked with, and whose validated error is the
-unit of the changes: those of the models from which evidence is stored."""
+"""Options of the fit of the model whose validated error is the unit of the changes: a network
+alone."""
 SIZES = (0.6, 1.0, 2.0)
 """RMS changes of the key points by single effects, as multiples of the model's validated error."""
 PAIR_SIZE = 1.2
@@ -352,6 +352,7 @@ def make_robot(name: str, data: Path, folder: Path, seed: int, tell: Progress) -
             "noise_mm": noise,
             "source": source,
             "seed": seed,
+            "fit": {"effects": [], "actuation": "measured"},
         },
     )
     made, left_out = 0, []

@@ -239,23 +239,33 @@ def rotation(vector: Tensor) -> Tensor:
     return unturned + along * cross + across * (cross @ cross)
 
 
-def arc_point(bend: Tensor, length: Tensor) -> Tensor:
+def arc_shape(bend: Tensor) -> tuple[Tensor, Tensor]:
+    """(1 - cos a) / a^2 and sin(a) / a, each (...), of arcs of bend (..., 2) in rad, a its norm."""
+    angle = (bend.square().sum(-1) + 1e-12).sqrt()
+    return 0.5 * torch.sinc(angle / (2 * math.pi)).square(), torch.sinc(angle / math.pi)
+
+
+def arc_point(bend: Tensor, length: Tensor, shape: tuple[Tensor, Tensor] | None = None) -> Tensor:
     """End of a circular arc that starts at the origin along z (Webster & Jones 2010).
 
-    bend (..., 2) in rad is the arc's angle a times its direction in x and y, length L (...,) in mm;
-    returns (..., 3) in mm: x, y = L (1 - cos a) / a^2 bend, z = L sin(a) / a.
+    bend (..., 2) in rad is the arc's angle a times its direction in x and y, length L (...,) in mm,
+    shape its `arc_shape`; returns (..., 3) in mm: x, y = L (1 - cos a) / a^2 bend, z = L sin(a) / a.
     """
-    square = bend.square().sum(-1)
-    angle = (square + 1e-12).sqrt()
-    across = 0.5 * torch.sinc(angle / (2 * math.pi)).square()
-    along = torch.sinc(angle / math.pi)
+    across, along = arc_shape(bend) if shape is None else shape
     return torch.cat([(length * across)[..., None] * bend, (length * along)[..., None]], -1)
 
 
-def arc_rotation(bend: Tensor) -> Tensor:
-    """(..., 3, 3) rotation from the start to the end of an arc of bend (..., 2) rad, no twist."""
+def arc_rotation(bend: Tensor, shape: tuple[Tensor, Tensor] | None = None) -> Tensor:
+    """(..., 3, 3) rotation from the start to the end of an arc of bend (..., 2) rad, no twist.
+
+    That of Rodrigues (1840) about the axis (-y, x, 0); shape: the arc's `arc_shape`.
+    """
+    across, along = arc_shape(bend) if shape is None else shape
     x, y = bend.unbind(-1)
-    return rotation(torch.stack([-y, x, torch.zeros_like(x)], -1))
+    xx, xy, yy = across * x * x, across * x * y, across * y * y
+    right, up = along * x, along * y
+    entries = [1 - xx, -xy, right, -xy, 1 - yy, up, -right, -up, 1 - xx - yy]
+    return torch.stack(entries, -1).unflatten(-1, (3, 3))
 
 
 class ConstantCurvature(nn.Module):
@@ -386,11 +396,14 @@ class ArcChain(nn.Module):
         turn = rotation(self.base_turn).expand(*x.shape[:-1], 3, 3)
         place = (self.base_mm + unit * self.base_shift).expand(*x.shape[:-1], 3)
         points = [place] if self.fixed_base else []
-        for number, offset in enumerate(self.offset):
-            bend = values[..., number, :2]
-            length = self.length_mm[number] * values[..., number, 2].exp()
-            place = place + (turn @ arc_point(bend, length)[..., None])[..., 0]
-            turn = turn @ arc_rotation(bend)
+        bend, length = values[..., :2], self.length_mm * values[..., 2].exp()
+        shape = arc_shape(bend)
+        steps, turns = arc_point(bend, length, shape)[..., None], arc_rotation(bend, shape)
+        for step, bent, offset in zip(
+            steps.unbind(-3), turns.unbind(-3), self.offset.unbind(), strict=True
+        ):
+            place = place + (turn @ step)[..., 0]
+            turn = turn @ bent
             points.append(place + unit * (turn @ offset))
         return torch.stack(points, -2)
 

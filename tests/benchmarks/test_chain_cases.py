@@ -232,3 +232,25 @@ def test_a_robot_states_the_budget_of_its_fit(tmp_path, monkeypatch):
         with pytest.raises(InterruptedError):
             folders.model_folder(tmp_path, "601", tmp_path / "work", few)
     assert asked == [BUILDS[601 % len(BUILDS)].epochs, folders.FEW_EPOCHS]
+
+
+def test_a_model_is_that_of_the_defaults_or_a_network_alone(tmp_path, monkeypatch):
+    """The model that the cases were made with is a network alone, and asked as such."""
+    asked, place = [], tmp_path / "robots" / "1"
+    (place / "before").mkdir(parents=True)
+    (place / "robot.json").write_text('{"fit": {"effects": []}}')
+
+    def no_fit(recordings, **fields):
+        asked.append((fields["prior"], fields["effects"]))
+        raise InterruptedError
+
+    monkeypatch.setattr(folders, "fit", no_fit)
+    for models in ("default", "alone"):
+        with pytest.raises(InterruptedError):
+            folders.model_folder(tmp_path, "1", tmp_path / "work", models=models)
+    (place / "model").mkdir()
+    (place / "model" / "config.json").write_text("{}")
+    with pytest.raises(InterruptedError):
+        folders.model_folder(tmp_path, "1", tmp_path / "work")
+    assert folders.model_folder(tmp_path, "1", tmp_path, models="alone") == place / "model"
+    assert asked == [(None, []), ("none", []), (None, [])]

@@ -12,6 +12,7 @@ from benchmarks.decision.evidence_log import (
     JUDGED,
     Labelled,
     append,
+    in_order,
     keep,
     posed_on,
     read,
@@ -36,6 +37,7 @@ from benchmarks.decision.table import (
     BINS,
     Judged,
     calibration_error,
+    default_models,
     goals,
     left_out,
     markdown,
@@ -345,17 +347,16 @@ def test_a_log_survives_a_broken_line_and_another_version(tmp_path):
     assert read(log) == [case(1)]
 
 
-def in_order(sources):
-    """All cases of stored sources in the order in which a fit reads them."""
-    some = [one for own in sources.values() for one in own]
-    return sorted(some, key=lambda one: (one.source, one.case))
+def all_of(files):
+    """All cases of stored files in the order in which a fit reads them."""
+    return in_order([one for own in files.values() for one in own])
 
 
 def test_the_asset_was_fitted_to_the_stored_evidence():
     """Sources, numbers of cases and hashes are those that the asset in force states."""
     values = json.loads(ASSET.read_text())
-    cases = in_order(stored())
-    assert {name: about(name, cases) for name in stored()} == values["sources"]
+    cases = all_of(stored())
+    assert {name: about(name, cases) for name in {one.source for one in cases}} == values["sources"]
 
 
 @pytest.mark.parametrize("name", list(FEATURES))
@@ -363,7 +364,7 @@ def test_the_stored_evidence_gives_the_weights_of_the_asset(name):
     """At the penalties that the asset states. (L-BFGS ends within 0.01 of the least loss' weights
     on any processor.)"""
     one = json.loads(ASSET.read_text())["models"][name]
-    model = fit_one(name, sample(name, in_order(stored())), one["penalty"], one["twin_weight"])
+    model = fit_one(name, sample(name, all_of(stored())), one["penalty"], one["twin_weight"])
     assert model.constant == pytest.approx(one["constant"], abs=0.01)
     assert model.weights == pytest.approx(list(one["weights"].values()), abs=0.01)
 
@@ -405,7 +406,7 @@ def test_robots_that_judge_took_no_part_in_the_fit():
     judges = stored(EVIDENCE / JUDGED)
     assert "elastica_b" in judges
     for name, some in judges.items():
-        kin = next((source for source in stored() if name.startswith(source)), name)
+        kin = next((source for source, _ in fitted if name.startswith(source)), name)
         assert not fitted & {(kin, one.robot) for one in some}
 
 
@@ -440,6 +441,26 @@ def test_without_options_the_fit_is_to_the_stored_evidence(tmp_path):
     new = Collected(Plan([1], []), included=["b"])
     with pytest.raises(InputError, match="--include b: expected a source that is only judged: a_b"):
         run(new, tmp_path / "work", 1, lambda *_: None, tmp_path)
+
+
+def test_default_models_are_reported_and_networks_alone_beside_them(tmp_path):
+    alone, own = some_cases("a"), some_cases("b", 30, seed=1)
+    default = [replace(one, models="default") for one in some_cases("a", 40, seed=2)]
+    keep(tmp_path, "a", alone)
+    keep(tmp_path, "a.default", default)
+    keep(tmp_path, "b", own)
+    cases, _, values = run(Collected(Plan([1], [])), tmp_path / "work", 1, print, tmp_path)
+    assert values["sources"]["a"]["cases"] == 80
+    asked = [(one.source, one.models) for one in default_models(cases)]
+    assert asked == [("a", "default")] * 40 + [("b", "alone")] * 30
+    left = [(one.source, one.models) for one in default_models(cases, default=False)]
+    assert left == [("a", "alone")] * 40
+    table = markdown(cases, values)
+    first, second = table.split("### The same cases with networks alone")
+    assert "| a | 4 | 40 |" in first
+    of = f"of {sum(one.label == 'known' and len(one.truth) == 1 for one in default)}"
+    assert of in first.split("named, alone")[1].splitlines()[0]
+    assert "| b |" not in second.split("### Costs chosen")[0]
 
 
 def test_without_any_evidence_the_message_says_what_to_do(tmp_path):

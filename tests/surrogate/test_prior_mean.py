@@ -71,7 +71,7 @@ def test_bends_recorded_one_by_one_give_the_arm_of_both():
     both = np.random.default_rng(0).uniform(0, 50, (200, 2))
     with torch.no_grad():
         error = prior(torch.tensor(both).float()) - torch.tensor(arm(both))
-    assert float(error.norm(dim=-1).max()) < 0.6, "of a motion of 100 mm: the ridge's bias"
+    assert float(error.norm(dim=-1).max()) < 0.7, "of a motion of 100 mm: the ridge's bias"
 
 
 def test_a_chamber_that_hardly_moved_gets_no_bend_of_its_own():

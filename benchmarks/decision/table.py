@@ -449,13 +449,14 @@ def markdown(
     which takes one fit for each of them.
     """
     models, alone = fits_without(cases), default_models(cases, default=False)
-    cases = default_models(cases)
+    cases, aside_alone = default_models(cases), default_models(aside, default=False)
+    aside = default_models(aside)
     by_source = left_out(cases, models)
     together = [one for some in by_source.values() for one in some]
     columns = by_source | ({"together": together} if len(by_source) > 1 else {})
     parts = ["## Cases", sources([*cases, *aside])]
-    if alone:
-        parts += ["### The same with networks alone, which the fit has, too", sources(alone)]
+    if alone or aside_alone:
+        parts += ["### The same with networks alone", sources([*alone, *aside_alone])]
     if columns:
         parts += ["## Each source left out of the fit", goals(columns)]
         parts += ["### Results by true effect", kinds(together)]
@@ -479,6 +480,9 @@ def markdown(
         parts += ["## Unseen robots", goals(new)]
         for name, some in new.items():
             parts += [f"### Results by true effect, {name}", kinds(some)]
+        if aside_alone:
+            parts += ["### The same unseen robots with networks alone"]
+            parts += [goals(_asides(aside_alone, values))]
     if each_robot:
         inside = robots_left_out(cases, alone)
         parts += ["## Each robot left out of the fit", goals({"all sources": inside})]

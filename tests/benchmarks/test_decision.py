@@ -461,6 +461,11 @@ def test_default_models_are_reported_and_networks_alone_beside_them(tmp_path):
     of = f"of {sum(one.label == 'known' and len(one.truth) == 1 for one in default)}"
     assert of in first.split("named, alone")[1].splitlines()[0]
     assert "| b |" not in second.split("### Costs chosen")[0]
+    new = [replace(one, models="default") for one in some_cases("c", 12, seed=3)]
+    table = markdown(cases, values, [*some_cases("c", 8, seed=4), *new])
+    unseen, beside = table.split("## Unseen robots")[1].split("### The same unseen robots")
+    assert "of 12)" in unseen.split("`cannot_tell`")[1].splitlines()[0].replace(";", ")")
+    assert "of 8)" in beside.split("`cannot_tell`")[1].splitlines()[0].replace(";", ")")
 
 
 def test_without_any_evidence_the_message_says_what_to_do(tmp_path):

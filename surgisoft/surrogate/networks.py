@@ -249,7 +249,8 @@ def arc_point(bend: Tensor, length: Tensor, shape: tuple[Tensor, Tensor] | None 
     """End of a circular arc that starts at the origin along z (Webster & Jones 2010).
 
     bend (..., 2) in rad is the arc's angle a times its direction in x and y, length L (...,) in mm,
-    shape its `arc_shape`; returns (..., 3) in mm: x, y = L (1 - cos a) / a^2 bend, z = L sin(a) / a.
+    shape its `arc_shape`; returns (..., 3) in mm: x, y = L (1 - cos a) / a^2 bend and
+    z = L sin(a) / a.
     """
     across, along = arc_shape(bend) if shape is None else shape
     return torch.cat([(length * across)[..., None] * bend, (length * along)[..., None]], -1)

@@ -47,7 +47,7 @@ from surgisoft.diagnosis.inputs import (
 )
 from surgisoft.diagnosis.other_models import open_model
 from surgisoft.diagnosis.pairs import BeforeAfter, Change, ChangeTrack, Paired, before_and_after
-from surgisoft.diagnosis.refit import LINE_OR_WALL, WALL_LAG, Refit, can_hide, refit_reason
+from surgisoft.diagnosis.refit import LINE_OR_WALL, Refit, can_hide, refit_reason
 from surgisoft.diagnosis.refit import refit as fit_candidates_together
 from surgisoft.diagnosis.residuals import Problem, Sealed, residual_table
 from surgisoft.diagnosis.selection import (
@@ -65,7 +65,7 @@ from surgisoft.measurement.histories import check_fits
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
-from surgisoft.surrogate.effects import in_words, known_effects
+from surgisoft.surrogate.effects import hypothesis_of, in_words, known_effects
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.workers import torch_threads
 
@@ -481,7 +481,8 @@ def with_refit(result: Diagnosis, joint: Refit, problem: Problem) -> Diagnosis:
         )
         ranking = tuple(_as_fitted(row, joint) if row.effect in effects else row for row in ranking)
         competing, plan = joint.competing, None
-        if joint.winner == WALL_LAG and problem.model.spec.actuation == "measured":
+        like_a_line = hypothesis_of(known_effects()[joint.winner]).like_a_line
+        if like_a_line and problem.model.spec.actuation == "measured":
             checks = (*checks, LINE_OR_WALL)
         if kind == "ambiguous":
             plan = recommend(problem, effects[:MOST_RIVALS]).experiment

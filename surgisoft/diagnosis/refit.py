@@ -284,8 +284,6 @@ LINE: Stage = "line"
 """Stage between a command and the pressure of a chamber. A first-order lag of the pressure and one
 of the wall are the same operator on the actuation: where both fit as well and the model's input is
 a command, which has passed a line in any case, the lag is that of the line."""
-WALL_LAG = "rate_dependence"
-"""The effect of the wall that is such a lag."""
 LINE_OR_WALL = (
     "a lag of the line would do the same, and is not tried, because the input counts as measured "
     "pressure, which has passed the line: if these columns are commands or a regulator's set "

@@ -60,6 +60,8 @@ class Hypothesis:
     needs_motion: bool = False
     """Whether the effect shows only while the actuation moves or shortly after, as a lag does:
     steady-state samples cannot show it."""
+    like_a_line: bool = False
+    """Whether the effect acts behind the line, and a lag of the line would do nearly the same."""
     absent_in: str = ""
     """Experimental setup (`diagnosis.design.schedules.SETUPS`) in which the effect cannot act;
     empty: there is none."""

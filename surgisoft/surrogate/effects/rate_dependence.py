@@ -165,5 +165,10 @@ def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
 
 # A wall has one fluid; several of both signs together would be a lead.
 HYPOTHESIS = Hypothesis(
-    RateDependence, _grid, combinations=no_combinations, needs_motion=True, memory="time"
+    RateDependence,
+    _grid,
+    combinations=no_combinations,
+    needs_motion=True,
+    like_a_line=True,
+    memory="time",
 )

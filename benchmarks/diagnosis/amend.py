@@ -31,8 +31,9 @@ class Amended:
 
     @property
     def share(self) -> float:
-        """Fall of the error as a share of the oracle's."""
-        return (self.before - self.after) / (self.before - self.oracle)
+        """Fall of the error as a share of the oracle's; 0 where the oracle has none."""
+        most = self.before - self.oracle
+        return (self.before - self.after) / most if most else 0.0
 
 
 def amended(

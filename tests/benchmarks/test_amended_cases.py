@@ -90,11 +90,12 @@ def test_shares_of_the_oracle():
         AmendedCase("a", ("creep",), "identified", Amended(("creep",), 2.0, 1.1, 1.0)),
         AmendedCase("b", ("creep",), "identified", Amended(("line_lag",), 4.0, 2.5, 1.0)),
         AmendedCase("c", ("creep",), "identified", Amended(("creep",), 1.05, 1.0, 1.0)),
+        AmendedCase("d", ("creep",), "identified", Amended((), 0.3, 0.3, 0.3)),
     ]
     rows = markdown({"chain": worth}).splitlines()
     assert rows[2] == "| chain | 2 | 70 % | 60 % | 1 | 90 % | 90 % |"
     cells = [row.split("|")[-2].strip() for row in rows if row.startswith("| chain | ")][1:]
-    assert sorted(cells) == ["-", "50 %", "90 %"]
+    assert sorted(cells) == ["-", "-", "50 %", "90 %"]
 
 
 def test_the_sources_that_took_no_part_are_judged_by_the_decision_in_force():

@@ -29,7 +29,14 @@ import numpy as np
 import torch
 
 from benchmarks import chain_cases, elastica_cases
-from benchmarks.decision.evidence_log import EVIDENCE, JUDGED, Labelled, in_order, stored
+from benchmarks.decision.evidence_log import (
+    EVIDENCE,
+    JUDGED,
+    Labelled,
+    files_of,
+    in_order,
+    stored,
+)
 from benchmarks.decision.fit import NAMING, fit, model_of
 from benchmarks.decision.folders import model_folder, robot_folder
 from benchmarks.decision.table import Judged, default_models, judged
@@ -69,12 +76,13 @@ class AmendedCase:
 def statements(source: str) -> list[Judged]:
     """What the decision says of the stored cases of a source that took no part in its fit."""
     aside = stored(EVIDENCE / JUDGED)
-    if source in aside:
-        return judged(aside[source], fitted_decision())
+    unseen = [case for file in files_of(source, aside) for case in aside[file]]
+    if unseen:
+        return judged(default_models(unseen), fitted_decision())
     every = in_order([case for some in stored().values() for case in some])
     names = sorted({case.source for case in every})
     if source not in names:
-        known = ", ".join((*aside, *names))
+        known = ", ".join((*sorted({file.partition(".")[0] for file in aside}), *names))
         raise InputError(f"{source}: no stored evidence of that name; there is {known}")
     own = default_models([case for case in every if case.source == source])
     return judged(own, model_of(fit([case for case in every if case.source != source])))

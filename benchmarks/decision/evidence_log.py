@@ -10,7 +10,7 @@ on and was never fitted to.
 import gzip
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -211,6 +211,11 @@ def read(path: Path) -> list[Labelled]:
 def file_of(source: str, models: Models) -> str:
     """Name of the file of a source's evidence, without its end."""
     return source if models == "alone" else f"{source}.{models}"
+
+
+def files_of(source: str, files: Iterable[str]) -> list[str]:
+    """The names among them of files of a source's evidence, of any models."""
+    return [file for file in files if file.partition(".")[0] == source]
 
 
 def in_order(some: Sequence[Labelled]) -> list[Labelled]:

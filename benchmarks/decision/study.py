@@ -11,6 +11,7 @@ from benchmarks.decision.evidence_log import (
     Labelled,
     Models,
     file_of,
+    files_of,
     in_order,
     keep,
     read,
@@ -83,10 +84,11 @@ def run(
             log, asked = logs / f"{file}.jsonl", (processes, report, fitted, fitted, new.models)
             target[file] = folders.run(name, folder, work / "models", log, *asked)
     for name in new.included:
-        if name not in aside:
-            known = ", ".join(sorted(aside)) or "none"
+        files = files_of(name, aside)
+        if not files:
+            known = ", ".join(sorted({file.partition(".")[0] for file in aside})) or "none"
             raise InputError(f"--include {name}: expected a source that is only judged: {known}")
-        every[name] = aside.pop(name)
+        every |= {file: aside.pop(file) for file in files}
     if not every:
         raise InputError(f"{evidence}: no stored evidence; give --count or --cases")
     if keeps:

@@ -65,12 +65,12 @@ class RefitConfig:
     """Trainings of each candidate, each with another part of the recordings left out, another order
     of the rows and other windows."""
     early_epochs: int = 2
-    """Epochs after which the first rung is looked at early: of few rows, networks stay close to
-    the given one where more training makes them worse elsewhere."""
+    """Epochs of the first stage of the first rung, whose result is scored, too: where rows are few,
+    more training improves a network on them and makes it worse on other motions."""
     first_epochs: int = 8
-    """Further epochs of the first rung, for all candidates and the rival."""
+    """Epochs of the second stage of the first rung, for all candidates and the rival."""
     epochs: int = 30
-    """Further epochs of the second rung, for the best candidates and the rival."""
+    """Epochs of the second rung, for the best candidates and the rival."""
     finalists: int = 3
     """Most candidates of the second rung."""
     seed: int = 0
@@ -132,7 +132,7 @@ class RefitCandidate:
     seeds_mm: tuple[float, ...]
     """Error of each seed on the part that it left out, mm."""
     rival_mm: float
-    """Error of the rival (the network alone) after as many epochs, on the same rows, mm."""
+    """Error of the rival (the network alone) at its own best stage, on the same rows, mm."""
     difference_mm: float
     """Rival less candidate, mm."""
     ci95_mm: tuple[float, float]
@@ -146,9 +146,9 @@ class RefitCandidate:
     p_value: float
     """Family-wise p-value: chance of so large a gain in any of the effects if none were missing."""
     epochs: int
-    """Epochs of each training."""
+    """Epochs of each training, up to the stage with the least held-out error."""
     stages: tuple[int, ...]
-    """The same by stage of the training, up to the one with the least held-out error."""
+    """Epochs of each of these stages."""
     plausible: bool
     """Whether the effect's parameters lay in their ranges after every training."""
     parameters: dict
@@ -170,7 +170,7 @@ class Refit:
     reason: str
     """Why it was done."""
     alone_mm: float
-    """Held-out error of the network without an effect, trained as long as the finalists, mm."""
+    """Held-out error of the network without an effect, at its best stage, mm."""
     candidates: tuple[RefitCandidate, ...]
     """All effects that were tried, the best first."""
     winner: str | None
@@ -285,8 +285,8 @@ LINE: Stage = "line"
 of the wall are the same operator on the actuation: where both fit as well and the model's input is
 a command, which has passed a line in any case, the lag is that of the line."""
 LINE_OR_WALL = (
-    "a lag of the line would do the same, and is not tried, because the input counts as measured "
-    "pressure, which has passed the line: if these columns are commands or a regulator's set "
+    "the model's input counts as measured actuation, which has already passed the line, so a lag "
+    "of the line, which would do the same, was not tried; if these columns are commands or set "
     "points, name them c1_kPa ... and fit with --actuation commanded"
 )
 """What is said where a lag of the wall is named for measured actuation."""

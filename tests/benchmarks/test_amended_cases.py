@@ -102,5 +102,8 @@ def test_the_sources_that_took_no_part_are_judged_by_the_decision_in_force():
     found = statements("elastica_b")
     assert len(found) == 36
     assert all(one.decision.confidence <= 1.0 for one in found)
+    asked = statements("mujoco")  # of both kinds of models those of the defaults
+    assert len(asked) == 105
+    assert {one.case.models for one in asked} == {"default"}
     with pytest.raises(InputError, match="no stored evidence"):
         statements("nobody")

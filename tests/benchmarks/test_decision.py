@@ -427,16 +427,18 @@ def test_without_options_the_fit_is_to_the_stored_evidence(tmp_path):
     keep(tmp_path, "a", some_cases("a"))
     keep(tmp_path, "b", some_cases("b", 30, seed=1))
     keep(tmp_path / JUDGED, "a_b", some_cases("a_b", 10, seed=2))
+    default = [replace(one, models="default") for one in some_cases("a_b", 10, seed=2)]
+    keep(tmp_path / JUDGED, "a_b.default", default)
     new = Collected(Plan([1], []))
     cases, aside, values = run(new, tmp_path / "work", 1, lambda *_: None, tmp_path)
-    assert (len(cases), len(aside)) == (70, 10)
+    assert (len(cases), len(aside)) == (70, 20)
     assert {name: one["cases"] for name, one in values["sources"].items()} == {"a": 40, "b": 30}
     assert values["command"] == "surgisoft benchmark decision"
     assert not (tmp_path / "work").exists()
     new = Collected(Plan([1], []), included=["a_b"])
     cases, aside, values = run(new, tmp_path / "work", 1, lambda *_: None, tmp_path)
-    assert (len(cases), len(aside)) == (80, 0)
-    assert values["sources"]["a_b"]["cases"] == 10
+    assert (len(cases), len(aside)) == (90, 0)
+    assert values["sources"]["a_b"]["cases"] == 20
     assert values["command"] == "surgisoft benchmark decision --include a_b"
     new = Collected(Plan([1], []), included=["b"])
     with pytest.raises(InputError, match="--include b: expected a source that is only judged: a_b"):

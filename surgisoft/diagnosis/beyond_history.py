@@ -70,7 +70,7 @@ def beyond_history(problem: Problem, features: np.ndarray) -> BeyondHistory:
     target = np.where(seen[..., None], problem.residual, 0.0).reshape(len(seen), -1)
     ones = np.ones((len(target), 1))
     columns = np.concatenate([ones, features], axis=1).astype(np.float32)
-    folds = _Folds(columns, target.astype(np.float32), problem.fold[problem.block])
+    folds = FoldsOfRidge(columns, target.astype(np.float32), problem.fold[problem.block])
     tried = [folds.remainder(ridge) for ridge in RIDGES]
     best = int(np.argmin([np.square(each, dtype=float).sum() for each in tried]))
     remainder = tried[best]
@@ -122,7 +122,7 @@ def sudden_turn(split: Split, points: np.ndarray) -> SuddenTurn:
     return SuddenTurn(losses[best], float(places[best]))
 
 
-class _Folds:
+class FoldsOfRidge:
     """Ridge regressions of a target on columns, one fold left out in turn.
 
     The first column is constant and has no penalty. Breaks enter by blockwise elimination: their

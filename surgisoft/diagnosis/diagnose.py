@@ -85,6 +85,11 @@ ABOUT = 1.1
 MOSTLY = 0.5
 """Share of what is left in one line of its spectrum from which the motion is said to be periodic:
 most of it."""
+JUMPING = 0.2
+"""Level of new jumps over the error (`Evidence.jumps`) from which on they are mentioned. Printed by
+`python -m benchmarks.decision.abrupt` for the stored cases."""
+SLIPPED = 0.1
+"""Shift of a key point (`Evidence.shift`) from which on it is mentioned; by the same command."""
 FITTED_STAGES = ("line", "material")
 """Stages of effects that a network can be fitted together with."""
 MOST_FITTED = 3
@@ -541,6 +546,10 @@ def result_of(found: Findings, decision: Decision | None = None) -> Diagnosis:
         )
     if kind == "unknown_effect":
         sentence += knock(evidence) + periodic(evidence)
+    told = [*jumping(evidence), *slipped(evidence)]
+    if kind == "unknown_effect":
+        sentence += "".join(f"; {each}" for each in told)
+        told = []
     plan = recommend(problem, effects).experiment if kind == "ambiguous" else None
     return Diagnosis(
         verdict=Verdict(kind, effects, sentence, round(sure, 4), decision.reason),
@@ -550,6 +559,7 @@ def result_of(found: Findings, decision: Decision | None = None) -> Diagnosis:
         next_experiment=plan,
         checks=(
             *data_quality_warnings(problem),
+            *told,
             *would_explain(found, decision),
             *amplitudes_that_vary(evidence, decision),
         ),
@@ -640,6 +650,28 @@ def periodic(evidence: Evidence) -> str:
         f"; {100 * evidence.line:.0f} % of what no function of the actuation explains is a motion "
         f"at {evidence.line_hz:.3g} Hz that the actuation does not have, as of a base that moves"
     )
+
+
+def jumping(evidence: Evidence) -> list[str]:
+    """That the body jumps, in words; empty where jumps are not a part of the error."""
+    if evidence.jumps < JUMPING:
+        return []
+    often = "once" if evidence.jump_count == 1 else f"{evidence.jump_count} times"
+    return [
+        f"the body jumps {often}, by up to {evidence.jump_largest_mm:.3g} mm, where neither the "
+        "actuation nor the predicted motion jumps: friction that sticks and slips, a wall that "
+        "snaps through, a valve that jams, or cameras that lose the markers"
+    ]
+
+
+def slipped(evidence: Evidence) -> list[str]:
+    """That one key point shifts against the others, in words; empty where none does."""
+    if evidence.shift < SLIPPED:
+        return []
+    return [
+        f"key point k{evidence.shift_key_point} is shifted by {evidence.shift_mm:.3g} mm against "
+        f"the others from {evidence.shift_at_s:.3g} s on: its marker has probably slipped"
+    ]
 
 
 def _left_by(found: Findings, effects: tuple[str, ...]) -> float:

@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
+from surgisoft.diagnosis.abrupt import body_jumps, key_point_shift
 from surgisoft.diagnosis.beyond_history import beyond_history, sudden_turn
+from surgisoft.diagnosis.residuals import Problem
 from surgisoft.diagnosis.selection import Findings, ModelSelection, Score, Selected
 from surgisoft.diagnosis.statistics import block_sums, studentised, variance_between
 from surgisoft.surrogate.effects import hypothesis_of, known_effects
@@ -180,6 +182,23 @@ class Evidence:
     where that is an effect that moves the base; 0 elsewhere."""
     sudden_margin: float = 0.0
     """Studentised mean over motions of that log gain."""
+    jumps: float = 0.0
+    """RMS size of the ten largest jumps of the body that neither the actuation nor the predicted
+    motion has, beyond those before the change, over the RMS error above the noise (`abrupt`)."""
+    jump_count: int = 0
+    """Number of these jumps."""
+    jump_largest_mm: float = 0.0
+    """RMS displacement of the key points in the largest of them, mm."""
+    shift: float = 0.0
+    """Root of the share of the error above the noise that the shift of one key point against the
+    others makes, times the log gain of the shift in the error of that key point; 0 where others
+    step with it (`abrupt.KeyPointShift.clarity`)."""
+    shift_mm: float = 0.0
+    """How far that key point is shifted, mm."""
+    shift_key_point: int = -1
+    """Number of that key point, from 0 at the base; -1 where the shift was not sought."""
+    shift_at_s: float = 0.0
+    """Time from which on it is shifted, s, all recordings in turn."""
 
     def to_json(self) -> dict:
         """Plain values; no frequency of a line where there is none, as in evidence of before."""
@@ -247,7 +266,24 @@ def evidence_of(found: Findings) -> Evidence:
         line_hz=beyond.line_hz,
         sudden_log_gain=float(sudden.mean()),
         sudden_margin=_margin(found, sudden),
+        **abrupt_changes(problem),
     )
+
+
+def abrupt_changes(problem: Problem) -> dict[str, Any]:
+    """The numbers of `Evidence` on jumps of the body and on a key point that shifts."""
+    table = problem.table
+    body, shift = table.jumps or body_jumps(table), key_point_shift(problem)
+    sizes = body.jumps.sizes_mm
+    return {
+        "jumps": body.share,
+        "jump_count": len(sizes),
+        "jump_largest_mm": float(sizes.max(initial=0.0)),
+        "shift": shift.clarity if shift else 0.0,
+        "shift_mm": shift.shift_mm if shift else 0.0,
+        "shift_key_point": shift.key_point if shift else -1,
+        "shift_at_s": shift.at_s if shift else 0.0,
+    }
 
 
 def sudden_log_gain(found: Selected) -> np.ndarray:

@@ -897,6 +897,7 @@ def fit_together(
         per_key_point_mm=validated.per_key_point_mm,
         rows=int(np.isfinite(problem.residual).all(2).any(1).sum()),
         noise_mm=problem.model.validation.noise_mm,
+        jump_mm=problem.model.validation.jump_mm,
     )
     model = trained[0].replace(validation=validation).eval().requires_grad_(False)
     model.training_residuals = model.residuals_on([problem.history])

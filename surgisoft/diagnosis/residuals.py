@@ -23,6 +23,7 @@ from surgisoft.diagnosis.body_frame import bending, frames
 from surgisoft.diagnosis.history_features import Memory, features, memory_of
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import actuation_of, check_fits, history_of
+from surgisoft.measurement.jumps import BodyJumps
 from surgisoft.measurement.noise import hold_noise, stated_noise
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.arm import ArmSpec
@@ -188,6 +189,9 @@ class ResidualTable:
     body_before_mm: np.ndarray | None = None
     """(N, n, 3) where they are paired differences: key points of BEFORE along the same motion, base
     frame, mm, without gaps."""
+    jumps: BodyJumps | None = None
+    """Jumps of the body as it was recorded, where recordings from before are known: the residuals
+    are then no longer those of the recorded body."""
 
     @property
     def spec(self) -> ArmSpec:

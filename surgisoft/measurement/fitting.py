@@ -1,17 +1,24 @@
 """Fit an arm model to recordings: system identification with a grey-box model."""
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import arm_spec, check_fits, history_of
+from surgisoft.measurement.jumps import find_jumps
+from surgisoft.measurement.noise import hold_noise, stated_noise
 from surgisoft.measurement.recordings import Recording, check_same_arm, load_recordings
 from surgisoft.surrogate.effects import named_effect
 from surgisoft.surrogate.fit import AUTO, FitConfig, FitResult
 from surgisoft.surrogate.fit import fit as fit_histories
 from surgisoft.surrogate.fitted_rows import FittedRows
+from surgisoft.surrogate.model import ArmModel
 from surgisoft.workers import torch_threads
 
 Recordings = Iterable[Recording | str | Path] | Recording | str | Path
@@ -59,13 +66,39 @@ def fit(
         check_fits(spec, held)
         _refuse_training_rows(train, held, actuation)
     with torch_threads(threads):
-        return fit_histories(
+        result = fit_histories(
             history_of(train, actuation),
             history_of(held, actuation) if held else None,
             spec,
             config,
             progress,
         )
+        model = result.model
+        model.validation = replace(model.validation, jump_mm=jump_level(model, train))
+    return result
+
+
+@torch.no_grad()
+def jump_level(model: ArmModel, recordings: list[Recording]) -> float:
+    """RMS size of the ten largest jumps of the body in recordings, mm (`jumps.Jumps.level_mm`).
+
+    An arm that jumps by itself, as by friction, does so before and after a change.
+    """
+    some = [recording for recording in recordings if recording.kind == "continuous"]
+    if not some:
+        return 0.0
+    spec = model.spec
+    history = history_of(some, spec.actuation)
+    noise = stated_noise(some) or hold_noise(some) or 0.0
+    measured = np.concatenate([recording.key_points_mm for recording in some])
+    return find_jumps(
+        history.rows(history.t_s).numpy(),
+        history.run_of_row.numpy(),
+        measured,
+        history.rows(model.predict(history)).double().numpy(),
+        history.rows(history.pressure).double().numpy(),
+        np.full(spec.key_points, math.sqrt(3.0) * noise),
+    ).level_mm
 
 
 def _refuse_training_rows(train: list[Recording], held: list[Recording], actuation: str) -> None:

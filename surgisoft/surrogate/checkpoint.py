@@ -87,8 +87,8 @@ def _network_config(network) -> dict:
 
 
 def _validation_config(validation: Validation) -> dict:
-    """JSON form of a validation, without its interval and the values that are not known."""
-    values = asdict(replace(validation, interval=None))
+    """JSON form of a validation, without interval, jumps and the values that are not known."""
+    values = asdict(replace(validation, interval=None, jump_mm=None))
     known = {name: value for name, value in values.items() if value is not None}
     return known if validation.rmse_mm is not None else {}
 
@@ -161,6 +161,8 @@ def save_model(
     if model.validation.interval is not None:
         # Beside the validation, where versions without intervals do not look.
         config["interval"] = model.validation.interval.to_json()
+    if model.validation.jump_mm is not None:
+        config["jump_mm"] = model.validation.jump_mm
     if model.fitted_rows is not None:
         config["fitted_rows"] = model.fitted_rows.to_json()
     with new_folder(folder, OWN_FILES) as fresh:
@@ -243,6 +245,7 @@ def load_model(
             for name, arguments in config["effects"].items()
         }
         stated = {"interval": _interval(config["interval"])} if config.get("interval") else {}
+        stated |= {"jump_mm": config["jump_mm"]} if "jump_mm" in config else {}
         validation = from_table(Validation, config["validation"] | stated, Where(file))
         model = ArmModel(spec, NETWORKS[kind][0](low, high, **network), effects, None, validation)
         model.load_state_dict(weights)

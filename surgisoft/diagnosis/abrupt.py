@@ -1,0 +1,176 @@
+"""Abrupt changes, which no effect of the list makes: jumps, and a key point that shifts.
+
+Every effect of the list is a continuous function of the actuation, its past and the time, so where
+the body jumps and its actuation does not, the cause is outside the list (`measurement.jumps`).
+
+A key point that shifts against its neighbours from one moment on is a marker that has slipped.
+Neighbouring key points lie on one body, so whatever physics changes, the residual of one follows
+from those of the others and from the actuation. What does not is an error of that key point alone.
+A step in it at one moment is sought on held-out blocks (with a known moment: Chow 1960; the moment
+is searched: Andrews 1993, "Tests for parameter instability and structural change with unknown
+change point", Econometrica 61).
+"""
+
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+
+import numpy as np
+
+from surgisoft.diagnosis.beyond_history import FoldsOfRidge
+from surgisoft.diagnosis.residuals import Problem, ResidualTable
+from surgisoft.diagnosis.statistics import block_sums
+from surgisoft.measurement.jumps import BodyJumps, Jumps, find_jumps
+
+MOMENTS = 96
+"""Moments that are tried for each key point."""
+MARGIN = 0.04
+"""Share of the rows before the first moment, and behind the last one."""
+RIDGE = 10.0
+"""Ridge on columns of mean square 1: the weight of ten rows."""
+LEAST_ABOVE = 0.02
+"""Least share of the squared error that counts as above the noise."""
+ALONE = 1.0 / 3.0
+"""Largest step of another key point at that moment, over that of the shifted one: where the whole
+body steps, its tip is shifted a little further than noisy neighbours say."""
+LEAST_ROWS = 100
+"""Fewest rows with all key points; with fewer there is no test."""
+
+
+def jumps_in(table: ResidualTable) -> Jumps:
+    """The jumps of the body in the rows of a table whose key points may be seen."""
+    rows = table.timed
+    return find_jumps(
+        table.t_s[rows],
+        table.run[rows],
+        table.measured_mm[rows],
+        table.predicted_mm[rows],
+        table.scaled_pressure[rows],
+        table.noise_mm,
+    )
+
+
+def body_jumps(table: ResidualTable, before_mm: float | None = None) -> BodyJumps:
+    """The jumps of the body in the training rows of a table.
+
+    before_mm: level of the jumps before the change in question, mm; None: that of the model's fit.
+    """
+    training = table.only("training")
+    square = np.square(training.error_mm)
+    noise = np.square(table.noise_mm).mean()
+    mean = float(np.nanmean(square))
+    known = training.model.validation.jump_mm if before_mm is None else before_mm
+    error = float(np.sqrt(max(mean - noise, LEAST_ABOVE * mean)))
+    return BodyJumps(jumps_in(training), known or 0.0, error)
+
+
+@dataclass(frozen=True)
+class KeyPointShift:
+    """The most probable shift of one key point against the others."""
+
+    key_point: int
+    """Its number, from 0 at the base."""
+    at_s: float
+    """Time from which on it is shifted, s, all recordings in turn (`ResidualTable.along_s`)."""
+    shift_mm: float
+    """How far it is shifted, mm."""
+    share: float
+    """Share, 0 to 1, of the whole squared error above the noise that the shift makes."""
+    others: float
+    """Largest step of another key point at that moment over that of this one, each beside a
+    function of the actuation."""
+    log_gain: float
+    """Mean over blocks of log(held-out error of the key point before / with the shift), the noise
+    added to both."""
+
+    @property
+    def clarity(self) -> float:
+        """Root of the share times the log gain; 0 where other key points step with this one."""
+        return float(np.sqrt(self.share)) * max(self.log_gain, 0.0) * (self.others <= ALONE)
+
+
+def key_point_shift(problem: Problem) -> KeyPointShift | None:
+    """The shift with the largest log gain; None with too few rows or a single key point."""
+    seen = np.isfinite(problem.residual).all(2)
+    points = np.flatnonzero(seen.any(0))
+    rows = np.flatnonzero(seen[:, points].all(1))
+    if len(points) < 2 or len(rows) < LEAST_ROWS:
+        return None
+    residual = problem.residual[rows][:, points]
+    noise = np.square(problem.noise_mm[points])
+    square = float(np.square(residual).sum((1, 2)).mean())
+    above = max(square - float(noise.sum()), LEAST_ABOVE * square, 1e-30)
+    block = np.unique(problem.block[rows], return_inverse=True)[1]
+    fold = problem.fold[problem.block[rows]]
+    behind = (np.linspace(MARGIN, 1.0 - MARGIN, MOMENTS) * len(rows)).astype(int)
+    actuation = _quadratic(problem.pressure[rows])
+    ones = np.ones((len(rows), 1), np.float32)
+    best: KeyPointShift | None = None
+    for place, point in enumerate(points):
+        others = np.delete(residual, place, axis=1).reshape(len(rows), -1)
+        columns = _scaled(
+            np.concatenate([actuation, others, problem.predicted[rows][:, point]], axis=1)
+        )
+        columns = np.concatenate([ones, columns], axis=1).astype(np.float32)
+        target = residual[:, place].astype(np.float32)
+        folds = FoldsOfRidge(columns, target, fold)
+        left = folds.remainder(RIDGE)
+        moment = int(np.argmax([_explained(left, first) for first in behind]))
+        (stepped,) = folds.with_breaks(RIDGE, ones, behind[[moment]])
+        plain, after = (
+            block_sums(np.square(each, dtype=float).sum(1), block) for each in (left, stepped)
+        )
+        floor = np.bincount(block) * noise[place]
+        gain = float(np.log((plain + floor) / (after + floor)).mean())
+        if best is not None and gain <= best.log_gain:
+            continue
+        shift = _step(columns, target, behind[moment])
+        part = behind[moment] / len(rows)
+        share = float(np.square(shift).sum()) * part * (1.0 - part) / above
+        row = problem.index.numpy()[rows[behind[moment]]]
+        best = KeyPointShift(
+            key_point=int(point),
+            at_s=float(problem.table.along_s[row]),
+            shift_mm=float(np.linalg.norm(shift)),
+            share=min(share, 1.0),
+            others=_others(actuation, residual, place, behind[moment]),
+            log_gain=gain,
+        )
+    return best
+
+
+def _explained(values: np.ndarray, first: int) -> float:
+    """What a step of the mean of values (S, 3) explains of their square, from a row on."""
+    part = first / len(values)
+    gap = values[first:].mean(0) - values[:first].mean(0)
+    return part * (1.0 - part) * float(np.square(gap, dtype=float).sum())
+
+
+def _quadratic(pressure: np.ndarray) -> np.ndarray:
+    """(S, F) actuation (S, m) and its products in twos."""
+    pairs = combinations_with_replacement(range(pressure.shape[1]), 2)
+    products = [pressure[:, i] * pressure[:, j] for i, j in pairs]
+    return np.concatenate([pressure, np.stack(products, axis=1)], axis=1)
+
+
+def _scaled(columns: np.ndarray) -> np.ndarray:
+    """Columns (S, F) without their means, of mean square 1."""
+    centred = columns - columns.mean(0)
+    return centred / np.maximum(np.sqrt(np.square(centred).mean(0)), 1e-9)
+
+
+def _others(actuation: np.ndarray, residual: np.ndarray, place: int, first: int) -> float:
+    """Largest step of another key point than one of residuals (S, k, 3) from a row on, over its."""
+    columns = np.concatenate([np.ones((len(actuation), 1)), _scaled(actuation)], axis=1)
+    steps = _step(columns, residual.reshape(len(residual), -1), first).reshape(-1, 3)
+    sizes = np.linalg.norm(steps, axis=1)
+    return float(np.delete(sizes, place).max() / max(sizes[place], 1e-30))
+
+
+def _step(columns: np.ndarray, target: np.ndarray, first: int) -> np.ndarray:
+    """(C,) step of a target (S, C), mm, from a row on, beside columns (S, F)."""
+    step = (np.arange(len(target)) >= first).astype(float)[:, None]
+    wide = columns.astype(float)
+    gram = wide.T @ wide + RIDGE * np.eye(wide.shape[1])
+    free = step - wide @ np.linalg.solve(gram, wide.T @ step)
+    left = target - wide @ np.linalg.solve(gram, wide.T @ target)
+    return (free.T @ left / (np.square(free).sum() + 1.0))[0]

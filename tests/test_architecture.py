@@ -71,7 +71,7 @@ FLOORS = {
         ("body_frame", "criteria", "history_features", "statistics", "weight"),
         ("residuals",),
         ("other_models",),
-        ("discrepancy", "data_quality", "error_axes", "inputs", "known_error"),
+        ("abrupt", "discrepancy", "data_quality", "error_axes", "inputs", "known_error"),
         ("pairs",),
         ("cross_validation",),
         ("black_box", "beyond_history", "candidates", "setup"),

@@ -1,19 +1,19 @@
 """How well jumps of the body and shifts of a key point tell what is outside the list.
 
 Run as `python -m benchmarks.decision.abrupt`. For each kind of case of the stored evidence it
-counts those in which `diagnose` mentions jumps (`JUMPING`) or a key point that has shifted
-(`SLIPPED`).
+counts those in which `diagnose` mentions jumps (`CLEAR_JUMPS`) or a key point that has shifted
+(`CLEAR_SHIFT`).
 """
 
 from collections.abc import Callable, Iterator, Sequence
 
 from benchmarks.decision.evidence_log import EVIDENCE, JUDGED, Labelled, in_order, stored
-from surgisoft.diagnosis.diagnose import JUMPING, SLIPPED
+from surgisoft.diagnosis.decision import CLEAR_JUMPS, CLEAR_SHIFT
 from surgisoft.diagnosis.evidence import Evidence
 
 TESTS: dict[str, Callable[[Evidence], bool]] = {
-    f"jumps >= {JUMPING:g}": lambda e: e.jumps >= JUMPING,
-    f"shift >= {SLIPPED:g}": lambda e: e.shift >= SLIPPED,
+    f"jumps >= {CLEAR_JUMPS:g}": lambda e: e.jumps >= CLEAR_JUMPS,
+    f"shift >= {CLEAR_SHIFT:g}": lambda e: e.shift >= CLEAR_SHIFT,
 }
 """What is counted."""
 

@@ -12,19 +12,16 @@ So nothing of a source that is judged enters any choice.
 
 import datetime
 import hashlib
-import itertools
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import optimize
 
 from benchmarks.decision.evidence_log import Labelled
-from surgisoft.diagnosis.criteria import WORTH, Worth
 from surgisoft.diagnosis.decision import (
     CALIBRATED,
-    CHOSEN_COSTS,
     FEATURES,
     LEAST_CHANCE,
     SCHEMA,
@@ -33,8 +30,6 @@ from surgisoft.diagnosis.decision import (
     DecisionModel,
     Logistic,
     Probabilities,
-    calibrated,
-    chosen,
     content_hash,
     decision_of,
     features_of,
@@ -67,17 +62,6 @@ CURVE_PENALTY = 1.0
 """Ridge penalty on constant and log slope of a calibration, in cases: a weak pull to no change."""
 TWIN_WEIGHTS = (0.0, 0.1, 0.3, 1.0)
 """Weights that are tried of a case whose truth was no candidate, in units of a real case."""
-NAME_COSTS = (1.0, 1.5, 2.0, 3.0, 4.0)
-"""Costs of a wrong and of a needless name that are tried, in units of what a right one gains: no
-less than that."""
-NAMED_LOST = 0.03
-"""Most known effects, as a share of them, that fewer wrong names may cost: that are named where a
-wrong name costs what a right one gains, and no more with the costs that are chosen. Stated."""
-UNKNOWN_COSTS = (0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
-"""Costs of a wrong "unknown" that are tried, in units of what a right one is worth, a
-factor of about 1.4 apart."""
-MOST_CALLED_UNKNOWN = 0.05
-"""Most known effects and unchanged arms, as a share of each source, that may be called unknown."""
 
 
 def sample(name: str, cases: Sequence[Labelled]) -> list[tuple[np.ndarray, np.ndarray, Labelled]]:
@@ -330,42 +314,6 @@ def curve_of(count: int, predicted: Predicted) -> Curve:
     return Curve(float(found.x[0]), float(np.exp(found.x[1])))
 
 
-def costs_of(predicted: Predicted, foreign: Predicted, curves: dict[str, Curve]) -> Worth:
-    """The costs of wrong results, from cases of robots (predicted) and sources (foreign) left out.
-
-    First those of a wrong name and of a needless one: with which the fewest names are wrong, and at
-    most `NAMED_LOST` fewer known effects are named than with the costs of `Worth`. Of equal ones
-    the least. Then the least cost of a wrong "unknown" with which, in sources left out, at most
-    `MOST_CALLED_UNKNOWN` of known effects and unchanged arms are called unknown. Shares are means
-    over the sources.
-    """
-    some = [(case, calibrated(chances, curves)) for case, chances in predicted]
-    known = [one for one in some if one[0].label == "known" and one[0].size >= WEAK]
-    abroad = [(case, calibrated(chances, curves)) for case, chances in foreign]
-    kept = [one for one in abroad if one[0].label in ("known", "clean")]
-
-    def share(of: Predicted, worth: Worth, hit: Callable[[Labelled, Decision], bool]) -> float:
-        rates = []
-        for source in sorted({case.source for case, _ in of}):
-            own = [(c, chosen(c.evidence, p, worth)) for c, p in of if c.source == source]
-            rates.append(np.mean([hit(*one) for one in own]))
-        return float(np.mean(rates)) if rates else 0.0
-
-    least = share(known, WORTH, names_truth) - NAMED_LOST
-    tried = []
-    for wrong, needless in itertools.product(NAME_COSTS, repeat=2):
-        worth = replace(WORTH, wrong_name=-wrong, needless_name=-needless)
-        if share(known, worth, names_truth) >= least:
-            tried.append((share(some, worth, names_wrongly), wrong + needless, worth))
-    worth = min(tried, key=lambda each: each[:2])[2]
-    for cost in UNKNOWN_COSTS:
-        worth = replace(worth, wrong_unknown=-cost)
-        called = share(kept, worth, lambda case, found: found.kind == "unknown_effect")
-        if called <= MOST_CALLED_UNKNOWN:
-            break
-    return worth
-
-
 def names_truth(case: Labelled, found: Decision) -> bool:
     """Whether a result names a missing effect, alone, as one of two, or in a set of two."""
     return found.kind in NAMING and bool(set(found.effects) & set(case.truth))
@@ -397,7 +345,6 @@ def fit(cases: Sequence[Labelled], command: str = "") -> dict:
             "without_truth": sum(bool(case.left_out) for _, _, case in samples[name]),
         }
     predicted = held_out(cases, settings, _robot_folds(cases))
-    foreign = held_out(cases, settings, _source_folds(cases)) or predicted
     curves = {name: curve_of(count, predicted) for count, name in enumerate(CALIBRATED, 1)}
     values = {
         "schema": SCHEMA,
@@ -410,8 +357,6 @@ def fit(cases: Sequence[Labelled], command: str = "") -> dict:
             for name, one in curves.items()
         },
     }
-    worth = costs_of(predicted, foreign, curves)
-    values |= {name: getattr(worth, name) for name in CHOSEN_COSTS}
     return values | {"sha256": content_hash(values)}
 
 

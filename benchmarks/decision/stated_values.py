@@ -16,9 +16,8 @@ from dataclasses import fields, replace
 
 from benchmarks.decision.evidence_log import EVIDENCE, JUDGED, Labelled, stored
 from benchmarks.decision.table import Judged
-from surgisoft.diagnosis.criteria import CLAIM, Claim, Worth
+from surgisoft.diagnosis.criteria import CLAIM, WORTH, Claim, Worth
 from surgisoft.diagnosis.decision import (
-    CHOSEN_COSTS,
     Decision,
     Probabilities,
     chosen,
@@ -44,12 +43,12 @@ def changed(name: str, value: float, factor: float) -> float:
     return min(value * factor, MOST_PROBABLE) if name == "least_probability" else value * factor
 
 
-def variants(worth: Worth) -> Iterator[tuple[str, float, float, Worth, Claim]]:
+def variants(worth: Worth = WORTH) -> Iterator[tuple[str, float, float, Worth, Claim]]:
     """Each stated value with each factor: (name, value, new value, costs, conditions)."""
     for given in (CLAIM, worth):
         for field in fields(given):
             value = getattr(given, field.name)
-            if field.name in CHOSEN_COSTS or not value:
+            if not value:
                 continue
             for factor in FACTORS:
                 other = changed(field.name, value, factor)
@@ -81,10 +80,7 @@ def table() -> str:
         cases = [case for some in stored(folder).values() for case in some]
         chances = [probabilities(case.evidence, model) for case in cases]
         groups.append(
-            [
-                (case, p, chosen(case.evidence, p, model.worth))
-                for case, p in zip(cases, chances, strict=True)
-            ]
+            [(case, p, chosen(case.evidence, p)) for case, p in zip(cases, chances, strict=True)]
         )
     counts = " and ".join(str(len(group)) for group in groups)
     lines = [
@@ -94,7 +90,7 @@ def table() -> str:
         "| other results, no part | right | wrong |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
-    for name, value, other, worth, claim in variants(model.worth):
+    for name, value, other, worth, claim in variants():
         cells = " | ".join(row(group, worth, claim) for group in groups)
         lines.append(f"| `{name}` | {value:.3g} | {other:.3g} | {cells} |")
     return "\n".join(lines)

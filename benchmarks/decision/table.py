@@ -18,8 +18,8 @@ from benchmarks.decision.fit import (
     names_truth,
     names_wrongly,
 )
-from surgisoft.diagnosis.criteria import Worth
-from surgisoft.diagnosis.decision import CHOSEN_COSTS, Decision, DecisionModel, decide
+from surgisoft.diagnosis.criteria import WORTH, Worth
+from surgisoft.diagnosis.decision import Decision, DecisionModel, decide
 
 BINS = (0.0, 0.5, 0.8, 0.9, 0.95, 1.0)
 """Bins of the reliability table."""
@@ -62,9 +62,7 @@ class Judged:
         return names_truth(self.case, self.decision)
 
 
-def judged(
-    cases: Sequence[Labelled], model: DecisionModel, worth: Worth | None = None
-) -> list[Judged]:
+def judged(cases: Sequence[Labelled], model: DecisionModel, worth: Worth = WORTH) -> list[Judged]:
     """What a fitted decision says of cases."""
     return [Judged(case, decide(case.evidence, model, worth)) for case in cases]
 
@@ -390,7 +388,7 @@ def trade_off(cases: Sequence[Labelled], models: dict[str, DecisionModel]) -> st
         some = []
         for source, model in models.items():
             own = [case for case in cases if case.source == source and not case.left_out]
-            worth = replace(model.worth, wrong_name=-cost, needless_name=-cost)
+            worth = replace(WORTH, wrong_name=-cost, needless_name=-cost)
             some += judged(own, model, worth)
         wrong = [one for one in some if one.decision.kind in NAMING and not one.right]
         named = {id(one) for one in some if one.decision.kind in NAMING}
@@ -418,23 +416,12 @@ def trade_off(cases: Sequence[Labelled], models: dict[str, DecisionModel]) -> st
 
 
 def curves(values: dict) -> str:
-    """The fitted calibrations and the chosen cost of an asset's values."""
+    """The fitted calibrations of an asset's values."""
     texts = [
         f"`{name}` {one['constant']:+.2f} {one['slope']:+.2f} x log odds"
         for name, one in values["calibration"].items()
     ]
-    costs = ", ".join(f"`{name}` {values[name]:g}" for name in CHOSEN_COSTS)
-    return f"Calibration: {'; '.join(texts)}. Worths that the fit chose: {costs}."
-
-
-def chosen_costs(models: dict[str, DecisionModel]) -> str:
-    """The costs that each fit without a source chose inside its cases."""
-    lines = ["| source left out | " + " | ".join(f"`{name}`" for name in CHOSEN_COSTS) + " |"]
-    lines += ["|---|" + "---|" * len(CHOSEN_COSTS)]
-    for source, model in models.items():
-        cells = [f"{getattr(model.worth, name):g}" for name in CHOSEN_COSTS]
-        lines.append(f"| {source} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+    return f"Calibration: {'; '.join(texts)}."
 
 
 def markdown(
@@ -468,7 +455,6 @@ def markdown(
             some = {name: own for name, own in left_out(alone, models).items() if own}
             columns = some | {"together": [one for own in some.values() for one in own]}
             parts += ["### The same cases with networks alone", goals(columns)]
-        parts += ["### Costs chosen", chosen_costs(models)]
         parts += ["### More or fewer names", trade_off(cases, models)]
     if aside:
         new = {f"{name}, fitted to all": some for name, some in _asides(aside, values).items()}

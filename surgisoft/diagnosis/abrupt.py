@@ -16,9 +16,8 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
-from surgisoft.diagnosis.beyond_history import FoldsOfRidge
 from surgisoft.diagnosis.residuals import Problem, ResidualTable
-from surgisoft.diagnosis.statistics import block_sums
+from surgisoft.diagnosis.statistics import FoldsOfRidge, block_sums
 from surgisoft.measurement.jumps import BodyJumps, Jumps, find_jumps
 
 MOMENTS = 96

@@ -3,8 +3,8 @@
 What a diagnosis names is decided by a fitted model (`decision`); its numbers stand in
 `assets/decision/decision.json` with the cases that they were fitted to. Here stand the settings of
 the search that proposes effects, generously, to that model, and the costs that its probabilities
-are weighed with. None of them was fitted to cases whose results are reported, but for the costs of
-a wrong name, a needless name and a wrong "unknown", which every fit chooses inside its own cases.
+are weighed with. None of them is fitted with it; the costs of a wrong name, a needless name and a
+wrong "unknown" are those that an earlier fit had chosen, on most of the cases that are reported.
 `python -m benchmarks.decision.stated_values` prints what results a halved and a doubled value of
 `Claim` and `Worth` changes (docs/results/decision.md).
 
@@ -62,19 +62,17 @@ class Search:
 class Worth:
     """Utility of a result to its reader: 1 for a right name, 0 for "cannot tell".
 
-    Stated, not fitted, but for the three costs that a fit chooses (`CHOSEN_COSTS`). A wrong name
-    costs at least what a right one gains, so a name is given where it is more probably right than
-    wrong, and says with its confidence how probably; `amend` shows on held-out data whether it does
-    what was promised.
+    Stated, not fitted. Costs that every fit chose for itself jumped by a factor of 1.5 from one set
+    of sources to another, and with them what was named (docs/results/decision.md).
     """
 
     needless_name: float = -1.0
-    """An effect is named, alone or in a set, and none of the list is missing. The fit chooses it
-    with the next one: with the fewest wrong names, and at most 3 % of the effects unnamed that
-    these two costs would name (`NAMED_LOST` in `benchmarks/decision/fit.py`)."""
-    wrong_name: float = -1.0
+    """An effect is named, alone or in a set, and none of the list is missing: `amend` shows on
+    held-out data that it does nothing."""
+    wrong_name: float = -3.0
     """An effect is named, alone or in a set, and another one of the list is missing; or two are
-    named together, and neither of them is missing but another one of the list."""
+    named together, and neither of them is missing but another one of the list. It costs most,
+    because the wrong effect explains some of the error and may stay in the model."""
     right_set: float = 0.7
     """The missing effect is one of two that are named as a set. A wrong set costs this share of a
     wrong name: its reader makes an experiment, and does not change the model."""
@@ -83,10 +81,9 @@ class Worth:
     what is wrong cancel, since `amend` shows that the other one does nothing."""
     first_of_pair: float = 0.5
     """One effect is named, alone or in a set, and another one is missing too."""
-    wrong_unknown: float = -0.5
-    """An effect of the list, or none, is called unknown: no model is changed for it. The fit
-    chooses it (`UNKNOWN_COSTS` in `benchmarks/decision/fit.py`): the least cost with which no more
-    than one in twenty known effects or unchanged arms is called unknown."""
+    wrong_unknown: float = -1.4
+    """An effect of the list, or none, is called unknown: no model is changed for it, but the effect
+    is not found either."""
     wrong_nothing: float = -2.0
     """Something is missing and the result is that nothing is."""
     wrong_network: float = -1.0

@@ -58,7 +58,7 @@ Reason = Literal["network", "learned", "repeatability", "few_data", "schedule"]
 what is missing; how well recordings of an unchanged arm agree is not known well enough; there are
 too few motions; the schedule does not tell effects apart."""
 
-SCHEMA = 5
+SCHEMA = 6
 """Version of the asset's format and of the features: weights belong to the features that they were
 fitted with, so an asset of another version is fitted again."""
 ASSET = Path(__file__).parents[1] / "assets" / "decision" / "decision.json"
@@ -80,6 +80,11 @@ FORM_SHARE = 0.02
 """Share of what an effect explains that its formula gets wrong on a real arm: two effects whose
 changes differ by less are not told apart by how sure the blocks are, and a second one that explains
 less besides is not told from the first one's form."""
+CLEAR_JUMPS = 0.2
+"""Level of new jumps over the error (`Evidence.jumps`) that counts in full, and from which on they
+are mentioned. The inner loss of the fits is flat about it (docs/results/decision.md)."""
+CLEAR_SHIFT = 0.1
+"""Shift of a key point (`Evidence.shift`) that counts in full and is mentioned from there on."""
 MOSTLY_STATIC = 0.8
 """Share of what a black box with memory explains that a static function must explain before an
 error that is too large for "nothing is missing" is put down to the model where no effect is
@@ -170,6 +175,16 @@ def _line(evidence: Evidence) -> float:
     A line that an effect of the list explains, such as a user-defined one, is none.
     """
     return _between(evidence.line * math.exp(min(_free_better(evidence), 0.0)), 0.0, 1.0)
+
+
+def _jumps(evidence: Evidence) -> float:
+    """Level of the jumps that are new, over the error."""
+    return _between(evidence.jumps / CLEAR_JUMPS, 0.0, 1.0)
+
+
+def _shift(evidence: Evidence) -> float:
+    """How clearly one key point shifts against the others."""
+    return _between(evidence.shift / CLEAR_SHIFT, 0.0, 1.0)
 
 
 def lack_of_fit(gain: float | None, log_gain: float | None) -> float:
@@ -317,6 +332,9 @@ def _single_lack_of_fit(evidence: Evidence) -> float:
     return lack_of_fit(one.form_gain, one.form_log_gain)
 
 
+JUMPS_MEAN = "new jumps of the body without one of the actuation, over the error"
+SHIFT_MEANS = "shift of one key point against the others, as a share of the error x log gain"
+
 MISSING = (
     Feature(
         "above_floor",
@@ -392,6 +410,8 @@ MISSING = (
         _line,
         "share of what a black box with memory leaves in one line of its spectrum",
     ),
+    Feature("jumps", +1, _jumps, JUMPS_MEAN),
+    Feature("shift", +1, _shift, SHIFT_MEANS),
 )
 BEYOND_HISTORY = (
     Feature(
@@ -406,6 +426,8 @@ BEYOND_HISTORY = (
         _line,
         "share of what a black box with memory leaves in one line of its spectrum",
     ),
+    Feature("jumps", -1, _jumps, JUMPS_MEAN),
+    Feature("shift", -1, _shift, SHIFT_MEANS),
 )
 """Features of two models: signs of what no function of the actuation and its past explains."""
 KNOWN = (
@@ -640,8 +662,6 @@ CALIBRATED = ("name", "set")
 """Probabilities that have a curve: that of the most probable effect, of the two most probable."""
 LEAST_CHANCE = 1e-6
 """Least probability whose log odds are taken."""
-CHOSEN_COSTS = ("wrong_name", "needless_name", "wrong_unknown")
-"""Fields of `Worth` that a fit chooses inside its own cases."""
 
 
 @dataclass(frozen=True)
@@ -654,8 +674,6 @@ class DecisionModel:
     """Sources, hashes, command and date of the fit."""
     curves: dict[str, Curve] = field(default_factory=dict)
     """The calibrations by name; one that is not there changes nothing."""
-    worth: Worth = WORTH
-    """What results are worth; CHOSEN_COSTS of it are chosen with the fit."""
 
 
 def content_hash(values: dict[str, Any]) -> str:
@@ -706,9 +724,6 @@ def load_decision(path: Path = ASSET) -> DecisionModel:
         given = _table(one)
         if name not in CALIBRATED or not all(_finite(given.get(k)) for k in ("constant", "slope")):
             raise InputError(f"{path.name}: calibration '{name}' is not readable; fit it again")
-    for name in CHOSEN_COSTS:
-        if not _finite(values.get(name, getattr(WORTH, name))):
-            raise InputError(f"{path.name}: {name} is not a finite number; fit it again")
     return decision_of(models, values)
 
 
@@ -723,10 +738,8 @@ def decision_of(models: dict[str, Logistic], values: dict[str, Any]) -> Decision
         name: Curve(one["constant"], one["slope"])
         for name, one in values.get("calibration", {}).items()
     }
-    costs = {name: values[name] for name in CHOSEN_COSTS if name in values}
-    worth = replace(WORTH, **costs)
     about = {key: value for key, value in values.items() if key not in fitted}
-    return DecisionModel(models, about, curves, worth)
+    return DecisionModel(models, about, curves)
 
 
 @lru_cache(maxsize=1)
@@ -930,15 +943,11 @@ def statements(
 def decide(
     evidence: Evidence,
     model: DecisionModel | None = None,
-    worth: Worth | None = None,
+    worth: Worth = WORTH,
     claim: Claim = CLAIM,
 ) -> Decision:
-    """The statement that is worth most to its reader, weighed with the fitted probabilities.
-
-    worth: what statements are worth; default that of the fitted decision.
-    """
-    model = model or fitted_decision()
-    return chosen(evidence, probabilities(evidence, model), worth or model.worth, claim)
+    """The statement that is worth most to its reader, weighed with the fitted probabilities."""
+    return chosen(evidence, probabilities(evidence, model or fitted_decision()), worth, claim)
 
 
 def chosen(

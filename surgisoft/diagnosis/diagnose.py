@@ -26,6 +26,8 @@ from surgisoft.diagnosis.candidates import candidates
 from surgisoft.diagnosis.criteria import SEARCH
 from surgisoft.diagnosis.data_quality import alarm_hints, data_quality_warnings, thinning_notes
 from surgisoft.diagnosis.decision import (
+    CLEAR_JUMPS,
+    CLEAR_SHIFT,
     Decision,
     Kind,
     Probabilities,
@@ -85,11 +87,6 @@ ABOUT = 1.1
 MOSTLY = 0.5
 """Share of what is left in one line of its spectrum from which the motion is said to be periodic:
 most of it."""
-JUMPING = 0.2
-"""Level of new jumps over the error (`Evidence.jumps`) from which on they are mentioned. Printed by
-`python -m benchmarks.decision.abrupt` for the stored cases."""
-SLIPPED = 0.1
-"""Shift of a key point (`Evidence.shift`) from which on it is mentioned; by the same command."""
 FITTED_STAGES = ("line", "material")
 """Stages of effects that a network can be fitted together with."""
 MOST_FITTED = 3
@@ -654,7 +651,7 @@ def periodic(evidence: Evidence) -> str:
 
 def jumping(evidence: Evidence) -> list[str]:
     """That the body jumps, in words; empty where jumps are not a part of the error."""
-    if evidence.jumps < JUMPING:
+    if evidence.jumps < CLEAR_JUMPS:
         return []
     often = "once" if evidence.jump_count == 1 else f"{evidence.jump_count} times"
     return [
@@ -666,7 +663,7 @@ def jumping(evidence: Evidence) -> list[str]:
 
 def slipped(evidence: Evidence) -> list[str]:
     """That one key point shifts against the others, in words; empty where none does."""
-    if evidence.shift < SLIPPED:
+    if evidence.shift < CLEAR_SHIFT:
         return []
     return [
         f"key point k{evidence.shift_key_point} is shifted by {evidence.shift_mm:.3g} mm against "

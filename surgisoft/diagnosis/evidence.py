@@ -19,7 +19,7 @@ from surgisoft.diagnosis.selection import Findings, ModelSelection, Score, Selec
 from surgisoft.diagnosis.statistics import block_sums, studentised, variance_between
 from surgisoft.surrogate.effects import hypothesis_of, known_effects
 
-VERSION = 4
+VERSION = 5
 """Version of the evidence, raised when a number gets another meaning: stored evidence of another
 version is collected again."""
 INDEPENDENT = 6.0

@@ -23,7 +23,6 @@ from benchmarks.decision.fit import (
     PRIORS,
     about,
     case_weights,
-    costs_of,
     curve_of,
     fit,
     fit_one,
@@ -45,10 +44,9 @@ from benchmarks.decision.table import (
     rate,
     serious,
 )
-from surgisoft.diagnosis.criteria import CLAIM, Claim, Worth
+from surgisoft.diagnosis.criteria import CLAIM, WORTH, Claim, Worth
 from surgisoft.diagnosis.decision import (
     ASSET,
-    CHOSEN_COSTS,
     FEATURES,
     Curve,
     Decision,
@@ -57,7 +55,6 @@ from surgisoft.diagnosis.decision import (
     chosen,
     content_hash,
     features_of,
-    fitted_decision,
     probabilities,
 )
 from surgisoft.diagnosis.diagnose import diagnose
@@ -188,53 +185,6 @@ def test_a_calibration_gives_back_how_often_effects_are_missing():
     assert curve(0.73) == pytest.approx(0.5, abs=0.02)
     assert curve(0.27) == pytest.approx(0.05, abs=0.02)
     assert curve_of(2, predicted) == Curve()
-
-
-@pytest.mark.parametrize(("chance", "cost"), [(0.25, 0.25), (0.4, 0.7), (0.6, 2.0)])
-def test_the_cost_of_a_wrong_unknown_keeps_known_effects_known(chance, cost):
-    """One in ten known effects, of sources left out, is outside the list with this probability."""
-    predicted = []
-    for number in range(20):
-        odd = number < 2
-        unknown = chance if odd else 0.0
-        effects = {"creep": 0.9}
-        if odd:
-            effects = {f"effect {place}": (1.0 - chance) / 5 for place in range(5)}
-        rest = 1.0 - unknown - sum(effects.values())
-        predicted.append((case(number), Probabilities(rest, 0.0, unknown, effects, 0.0, ())))
-    usual = predicted[2:]
-    assert costs_of(usual, predicted, {}).wrong_unknown == -cost, "of sources left out"
-    assert costs_of(predicted, usual, {}).wrong_unknown == -0.25
-
-
-@pytest.mark.parametrize(
-    ("wrong", "right", "needless", "costs"),
-    [
-        (0, 0, 0, (1.0, 1.0)),
-        (2, 0, 0, (1.5, 1.0)),
-        (2, 1, 0, (1.5, 1.0)),
-        (2, 2, 0, (1.0, 1.0)),
-        (0, 0, 5, (1.0, 3.0)),
-        (2, 1, 5, (1.5, 3.0)),
-    ],
-)
-def test_the_fewest_wrong_names_that_cost_few_right_ones(wrong, right, needless, costs):
-    """Of 40 known effects some would be named wrongly, and some rightly, with a probability of
-    0.53, and some of ten unchanged arms be given a name with 0.7. A name of probability p is given
-    where p > cost (1 - p), and a fortieth of the right ones may be lost for it, but not two."""
-    predicted = []
-    for number in range(40):
-        sure = 0.99 if number >= wrong + right else 0.53
-        names = {"drift" if number < wrong else "creep": sure}
-        names |= {f"other {place}": (1.0 - sure) / 9 for place in range(9)}
-        predicted.append((case(number), Probabilities(0.0, 0.0, 0.0, names, 0.0, ())))
-    for number in range(10):
-        chance = 0.7 if number < needless else 0.0
-        clean = case(number, label="clean", truth=(), size=0.0)
-        chances = Probabilities(1 - chance, 0.0, 0.0, {"creep": chance}, 0.0, ())
-        predicted.append((clean, chances))
-    found = costs_of(predicted, predicted, {})
-    assert (-found.wrong_name, -found.needless_name) == costs
 
 
 def test_cases_without_their_truth_share_the_weight_of_unknown_ones():
@@ -370,13 +320,12 @@ def test_the_stored_evidence_gives_the_weights_of_the_asset(name):
 
 
 def test_stated_values_are_varied_one_at_a_time():
-    worth = fitted_decision().worth
-    tried = list(stated_values.variants(worth))
+    tried = list(stated_values.variants())
     names = {field.name for some in (Claim, Worth) for field in fields(some)}
-    assert {name for name, *_ in tried} == names - set(CHOSEN_COSTS) - {"half_pair"}
+    assert {name for name, *_ in tried} == names - {"half_pair"}
     for name, value, other, costs, claim in tried:
         both = asdict(costs) | asdict(claim)
-        default = asdict(worth) | asdict(CLAIM)
+        default = asdict(WORTH) | asdict(CLAIM)
         assert {key for key in both if both[key] != default[key]} == {name}
         assert (both[name], default[name]) == (other, value)
     assert stated_values.changed("near_floor", 1.3, 2.0) == pytest.approx(1.6)
@@ -386,17 +335,16 @@ def test_stated_values_are_varied_one_at_a_time():
 
 def test_a_stated_value_changes_the_results_that_it_decides():
     """Where "nothing is missing" may never be claimed, just these results change."""
-    worth = fitted_decision().worth
     cases = [case for case in stored()["own_rig"] if case.label == "clean"][:8]
     some = [
-        (case, chances := probabilities(case.evidence), chosen(case.evidence, chances, worth))
+        (case, chances := probabilities(case.evidence), chosen(case.evidence, chances))
         for case in cases
     ]
-    assert stated_values.row(some, worth, CLAIM) == "0 | +0 | +0"
+    assert stated_values.row(some, WORTH, CLAIM) == "0 | +0 | +0"
     never = replace(CLAIM, most_over_validated=0.0)
     quiet = sum(found.kind == "nothing_missing" for _, _, found in some)
     assert quiet > 0
-    assert int(stated_values.row(some, worth, never).split(" | ")[0]) == quiet
+    assert int(stated_values.row(some, WORTH, never).split(" | ")[0]) == quiet
 
 
 def test_robots_that_judge_took_no_part_in_the_fit():
@@ -462,7 +410,7 @@ def test_default_models_are_reported_and_networks_alone_beside_them(tmp_path):
     assert "| a | 4 | 40 |" in first
     of = f"of {sum(one.label == 'known' and len(one.truth) == 1 for one in default)}"
     assert of in first.split("named, alone")[1].splitlines()[0]
-    assert "| b |" not in second.split("### Costs chosen")[0]
+    assert "| b |" not in second.split("### More or fewer names")[0]
     new = [replace(one, models="default") for one in some_cases("c", 12, seed=3)]
     table = markdown(cases, values, [*some_cases("c", 8, seed=4), *new])
     unseen, beside = table.split("## Unseen robots")[1].split("### The same unseen robots")

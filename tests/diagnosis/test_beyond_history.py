@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surgisoft.diagnosis.beyond_history import BREAK_RIDGE, RIDGES, beyond_history, sudden_turn
+from surgisoft.diagnosis.beyond_history import RIDGES, beyond_history, sudden_turn
 from surgisoft.diagnosis.candidates import candidates
 from surgisoft.diagnosis.cross_validation import split_of
 from surgisoft.diagnosis.evidence import sudden_log_gain
 from surgisoft.diagnosis.residuals import problem_of
 from surgisoft.diagnosis.selection import select
-from surgisoft.diagnosis.statistics import studentised
+from surgisoft.diagnosis.statistics import BREAK_RIDGE, studentised
 from surgisoft.surrogate.model import Validation
 from tests.diagnosis.synthetic import NOISE_MM, PERIOD_S, recording, still_model, walk
 

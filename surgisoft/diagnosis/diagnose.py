@@ -543,7 +543,9 @@ def result_of(found: Findings, decision: Decision | None = None) -> Diagnosis:
         )
     if kind == "unknown_effect":
         sentence += knock(evidence) + periodic(evidence)
-    told = [*jumping(evidence), *slipped(evidence)]
+    told = slipped(evidence, len(problem.table.names))
+    if not told or evidence.jump_count > 1:
+        told += jumping(evidence)
     if kind == "unknown_effect":
         sentence += "".join(f"; {each}" for each in told)
         told = []
@@ -661,13 +663,18 @@ def jumping(evidence: Evidence) -> list[str]:
     ]
 
 
-def slipped(evidence: Evidence) -> list[str]:
-    """That one key point shifts against the others, in words; empty where none does."""
+def slipped(evidence: Evidence, recordings: int = 1) -> list[str]:
+    """That one key point shifts against the others, in words; empty where none does.
+
+    recordings: how many there are.
+    """
     if evidence.shift < CLEAR_SHIFT:
         return []
+    when = f"{evidence.shift_at_s:.3g} s on" + ", all recordings in turn" * (recordings > 1)
     return [
         f"key point k{evidence.shift_key_point} is shifted by {evidence.shift_mm:.3g} mm against "
-        f"the others from {evidence.shift_at_s:.3g} s on: its marker has probably slipped"
+        f"the others from {when}: its marker has probably slipped, so use the part before it or "
+        "record again"
     ]
 
 

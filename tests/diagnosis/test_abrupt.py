@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from surgisoft.diagnosis.abrupt import body_jumps, jumps_in, key_point_shift
-from surgisoft.diagnosis.diagnose import jumping, slipped
+from surgisoft.diagnosis.diagnose import diagnose, jumping, slipped
 from surgisoft.diagnosis.evidence import abrupt_changes
 from surgisoft.diagnosis.pairs import before_and_after
 from surgisoft.diagnosis.residuals import problem_of, residual_table
@@ -142,11 +142,26 @@ def test_the_words_say_what_was_put_in():
     (told,) = slipped(slip)
     assert told.startswith("key point k2 is shifted by 0.")
     assert "from 5" in told or "from 4" in told
+    assert "in turn" not in told
+    assert "s on, all recordings in turn: " in slipped(slip, 2)[0]
     assert jumping(evidence(still_model(), [moved_by(bending())])) == []
     assert slipped(evidence(still_model(), [moved_by(bending())])) == []
     (told,) = jumping(evidence(still_model(), [moved_by(stuck())]))
     assert told.startswith("the body jumps ")
     assert "times, by up to" in told
+
+
+def test_the_result_says_it_once():
+    """A slip is a jump, too, but is told as a slip; beside a named effect both are checks."""
+    told = diagnose(still_model(), [moved_by(bending() + shifted(2, 500, [0.0, 1.6, 0.0]))])
+    words = (told.verdict.sentence, *told.checks)
+    assert sum("is shifted by" in each for each in words) == 1
+    assert not any("the body jumps" in each for each in words)
+    many = diagnose(still_model(), [moved_by(stuck())])
+    words = (many.verdict.sentence, *many.checks)
+    assert sum("the body jumps" in each for each in words) == 1
+    if many.verdict.kind == "unknown_effect":
+        assert "the body jumps" in many.verdict.sentence
 
 
 def test_a_stored_model_keeps_its_jumps(tmp_path):

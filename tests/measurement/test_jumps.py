@@ -156,6 +156,7 @@ def test_samples_at_one_time_have_none():
     points = smooth_motion()[1]
     points[1000:] += 5.0
     assert not len(looked_at(points, time=np.zeros(ROWS)).rows)
+    assert not len(looked_at(points, time=np.full(ROWS, np.nan)).rows)
     assert not len(looked_at(np.full_like(points, np.nan)).rows)
     assert not len(looked_at(points[:3], points[:3], points[:3, 0], TIME[:3], RUN[:3]).rows)
 

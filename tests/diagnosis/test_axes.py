@@ -161,5 +161,5 @@ def test_a_diagnosis_names_an_axis_that_is_clear(monkeypatch, share, low, named)
     before = Diagnosis(verdict, ErrorLevels(1.0, 0.1, 0.5), ())
     result = diagnosing.with_axis(before, None)
     assert result.axis == ("pressure" if named else None)
-    more = "; it depends most on pressure (30 %)" if named else ""
+    more = "; the error depends most on pressure (30 %)" if named else ""
     assert result.verdict.sentence == "the cause is unknown" + more

@@ -26,7 +26,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 import torch
 
-from surgisoft.diagnosis.abrupt import body_jumps, jumps_in
+from surgisoft.diagnosis.abrupt import body_jumps, own_jumps_mm
 from surgisoft.diagnosis.discrepancy import LENGTHS
 from surgisoft.diagnosis.known_error import known_error
 from surgisoft.diagnosis.residuals import (
@@ -1011,7 +1011,7 @@ def before_and_after(
         raise InputError("no recording from before the change; expected at least one")
     other = residual_table(table.model, list(before))
     _check_common_range(table, other)
-    table = replace(table, jumps=body_jumps(table, jumps_in(other).level_mm))
+    table = replace(table, jumps=body_jumps(table, own_jumps_mm(other)))
     if paired == "never":
         empty = replace(other, run=np.full(len(other.run), -1))
         return BeforeAfter(

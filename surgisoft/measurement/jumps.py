@@ -146,6 +146,28 @@ def find_jumps(
     return Jumps(moments[order], sizes, len(moments) * step / 60.0)
 
 
+def own_level_mm(
+    t_s: np.ndarray,
+    run: np.ndarray,
+    measured_mm: np.ndarray,
+    predicted_mm: np.ndarray,
+    actuation: np.ndarray,
+    noise_mm: np.ndarray,
+) -> float:
+    """Level of the jumps that an arm makes by itself, mm; 0 where all have a cause.
+
+    Arguments as for `find_jumps`. Which jumps have a cause depends on what the columns of the
+    actuation show: commands do not show what motors and valves make of them. So where some have
+    none, all jumps of the body count, those with a cause too.
+    """
+    found = find_jumps(t_s, run, measured_mm, predicted_mm, actuation, noise_mm)
+    if not len(found.rows):
+        return 0.0
+    still, nothing = np.zeros_like(measured_mm), np.zeros((len(run), 1))
+    every = find_jumps(t_s, run, measured_mm, still, nothing, noise_mm)
+    return max(found.level_mm, every.level_mm)
+
+
 def _side(step_s: float) -> int:
     """Rows on each side of a jump."""
     return max(LEAST_ROWS, min(ROWS, int(LONGEST_S / step_s)), round(WINDOW_S / step_s))

@@ -59,8 +59,8 @@ class Validation:
     """How far measured key points lie from predicted ones; None for models that were fitted before
     this was computed, and after effects were added to the fitted ones."""
     jump_mm: float | None = None
-    """RMS size of the ten largest jumps of the body in the recordings of the fit, mm, which neither
-    the actuation nor the predicted motion has (`measurement.jumps`); None where it is not known."""
+    """Level of the jumps that the arm makes by itself in the recordings of the fit, mm
+    (`measurement.jumps.own_level_mm`); None where it is not known."""
 
 
 @dataclass(frozen=True, eq=False)

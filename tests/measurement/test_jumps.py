@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from surgisoft.measurement.jumps import BodyJumps, Jumps, find_jumps
+from surgisoft.measurement.jumps import BodyJumps, Jumps, find_jumps, own_level_mm
 
 STEP_S = 0.05
 ROWS = 2000
@@ -190,6 +190,21 @@ def test_units_do_not_matter(length, unit):
     )
     assert other.rows.tolist() == one.rows.tolist() == [900]
     assert other.sizes_mm == pytest.approx(length * one.sizes_mm, rel=1e-3)
+
+
+def test_of_an_arm_that_jumps_by_itself_all_jumps_count():
+    """Its actuation jumps by several mm every 3 s; without a jump of its own its level is 0."""
+    actuation, rows = steps()
+    ways = np.array([[3.0, 0.0, -0.5], [0.0, 4.0, -0.5]])
+    points = np.array([0.2, 0.6, 1.0])[:, None] * (actuation @ ways)[:, None, :]
+    given = (TIME, RUN), (points, actuation, NOISE)
+    assert own_level_mm(*given[0], points + noise(), *given[1]) == 0.0
+    jumping = points + noise()
+    jumping[rows[5] + 30 :] += 0.5
+    found = own_level_mm(*given[0], jumping, *given[1])
+    sizes = np.sort(np.sqrt(np.square(np.diff(points, axis=0)).sum((1, 2)) / 3.0))[::-1]
+    assert found == pytest.approx(np.sqrt(np.square(sizes[:10]).mean()), rel=0.1)
+    assert found > 1.0
 
 
 def test_jumps_of_before_do_not_count():

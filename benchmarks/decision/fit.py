@@ -5,9 +5,8 @@ sign constraints by bounded L-BFGS: Byrd et al. 1995). Every source counts alike
 cases; pairs have a stated share of every source (PRIORS). The penalty of each model is chosen by
 leaving out one source after another, and one group of robots after another, within the cases that
 it is fitted to. Robots left out inside the same cases also give the curves that calibrate the first
-effect and the set of two (Platt 1999), and the costs of names; sources left out give the cost of a
-wrong "unknown", since an arm that is like none of the cases is what looks like an unknown effect.
-So nothing of a source that is judged enters any choice.
+effect and the set of two (Platt 1999). So nothing of a source that is judged enters any choice. The
+costs of wrong results are stated (`surgisoft.diagnosis.criteria.Worth`).
 """
 
 import datetime

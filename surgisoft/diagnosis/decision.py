@@ -332,9 +332,9 @@ def _single_lack_of_fit(evidence: Evidence) -> float:
     return lack_of_fit(one.form_gain, one.form_log_gain)
 
 
-JUMPS_MEAN = "new jumps of the body without one of the actuation, over the error"
-SHIFT_MEANS = "shift of one key point against the others, as a share of the error x log gain"
-
+JUMPS_MEANS = "level of the body's new jumps that the actuation does not have, over the error"
+SHIFT_MEANS = "root of the share of the error that one shifted key point makes, times its log gain"
+"""Meanings of two features that three models have."""
 MISSING = (
     Feature(
         "above_floor",
@@ -410,7 +410,7 @@ MISSING = (
         _line,
         "share of what a black box with memory leaves in one line of its spectrum",
     ),
-    Feature("jumps", +1, _jumps, JUMPS_MEAN),
+    Feature("jumps", +1, _jumps, JUMPS_MEANS),
     Feature("shift", +1, _shift, SHIFT_MEANS),
 )
 BEYOND_HISTORY = (
@@ -426,7 +426,7 @@ BEYOND_HISTORY = (
         _line,
         "share of what a black box with memory leaves in one line of its spectrum",
     ),
-    Feature("jumps", -1, _jumps, JUMPS_MEAN),
+    Feature("jumps", -1, _jumps, JUMPS_MEANS),
     Feature("shift", -1, _shift, SHIFT_MEANS),
 )
 """Features of two models: signs of what no function of the actuation and its past explains."""

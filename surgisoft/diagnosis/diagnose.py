@@ -658,9 +658,9 @@ def jumping(evidence: Evidence) -> list[str]:
         return []
     often = "once" if evidence.jump_count == 1 else f"{evidence.jump_count} times"
     return [
-        f"the body jumps {often}, by up to {evidence.jump_largest_mm:.3g} mm, where neither the "
-        "actuation nor the predicted motion jumps: friction that sticks and slips, a wall that "
-        "snaps through, a valve that jams, or cameras that lose the markers"
+        f"the body jumps {often}, by up to {evidence.jump_largest_mm:.3g} mm, while neither the "
+        "actuation nor the predicted motion jumps (possible causes: stick-slip friction, "
+        "snap-through of the wall, impacts on the arm or its base, lost markers)"
     ]
 
 
@@ -674,8 +674,8 @@ def slipped(evidence: Evidence, recordings: int = 1) -> list[str]:
     when = f"{evidence.shift_at_s:.3g} s on" + ", all recordings in turn" * (recordings > 1)
     return [
         f"key point k{evidence.shift_key_point} is shifted by {evidence.shift_mm:.3g} mm against "
-        f"the others from {when}: its marker has probably slipped, so use the part before it or "
-        "record again"
+        f"the others from {when}: its marker has probably slipped, so use the rows before that "
+        "time or record again"
     ]
 
 

@@ -1,9 +1,8 @@
-"""Jumps of a body: sudden displacements that neither its actuation nor its motion accounts for.
+"""Jumps of a body: sudden displacements that neither the actuation nor the prediction explains.
 
-A soft arm under continuous actuation moves continuously. Where it jumps, something gives way:
-friction that sticks and slips, a wall that snaps through, a torn fibre, a tube that opens, a marker
-that is lost. No effect of a model that is a continuous function of the actuation and its past does
-that, so jumps tell such causes from all of those effects, whatever their form.
+An effect that is a continuous function of the actuation and its past makes no jump under
+continuous actuation. Stick-slip friction, snap-through of the wall, impacts and lost markers do, so
+jumps tell such causes from all continuous effects, whatever their form.
 
 A jump is the difference of two one-sided local linear estimates of a key point's place, from the
 rows just before and just behind a moment (Müller 1992, "Change-points in nonparametric regression

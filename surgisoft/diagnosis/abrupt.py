@@ -18,7 +18,7 @@ import numpy as np
 
 from surgisoft.diagnosis.residuals import Problem, ResidualTable
 from surgisoft.diagnosis.statistics import FoldsOfRidge, block_sums
-from surgisoft.measurement.jumps import BodyJumps, Jumps, find_jumps, own_level_mm
+from surgisoft.measurement.jumps import BodyJumps, Jumps, Motion, find_jumps, own_level_mm
 
 MOMENTS = 96
 """Moments that are tried for each key point."""
@@ -37,24 +37,24 @@ LEAST_ROWS = 100
 
 def jumps_in(table: ResidualTable) -> Jumps:
     """The jumps of the body in the rows of a table whose key points may be seen."""
-    return find_jumps(*_series(table))
+    return find_jumps(_motion(table))
 
 
 def own_jumps_mm(table: ResidualTable) -> float:
     """Level of the jumps that the arm makes by itself, mm (`jumps.own_level_mm`)."""
-    return own_level_mm(*_series(table))
+    return own_level_mm(_motion(table))
 
 
-def _series(table: ResidualTable) -> tuple[np.ndarray, ...]:
-    """What jumps are sought in: the rows of continuous recordings."""
+def _motion(table: ResidualTable) -> Motion:
+    """The motion in a table's continuous recordings."""
     rows = table.timed
-    return (
-        table.t_s[rows],
-        table.run[rows],
-        table.measured_mm[rows],
-        table.predicted_mm[rows],
-        table.scaled_pressure[rows],
-        table.noise_mm,
+    return Motion(
+        t_s=table.t_s[rows],
+        run=table.run[rows],
+        measured_mm=table.measured_mm[rows],
+        predicted_mm=table.predicted_mm[rows],
+        actuation=table.scaled_pressure[rows],
+        noise_mm=table.noise_mm,
     )
 
 

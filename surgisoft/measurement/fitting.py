@@ -11,7 +11,7 @@ import torch
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import arm_spec, check_fits, history_of
-from surgisoft.measurement.jumps import own_level_mm
+from surgisoft.measurement.jumps import Motion, own_level_mm
 from surgisoft.measurement.noise import hold_noise, stated_noise
 from surgisoft.measurement.recordings import Recording, check_same_arm, load_recordings
 from surgisoft.surrogate.effects import named_effect
@@ -91,14 +91,15 @@ def jump_level(model: ArmModel, recordings: list[Recording]) -> float:
     history = history_of(some, spec.actuation)
     noise = stated_noise(some) or hold_noise(some) or 0.0
     measured = np.concatenate([recording.key_points_mm for recording in some])
-    return own_level_mm(
-        history.rows(history.t_s).numpy(),
-        history.run_of_row.numpy(),
-        measured,
-        history.rows(model.predict(history)).double().numpy(),
-        history.rows(history.pressure).double().numpy(),
-        np.full(spec.key_points, math.sqrt(3.0) * noise),
+    motion = Motion(
+        t_s=history.rows(history.t_s).numpy(),
+        run=history.run_of_row.numpy(),
+        measured_mm=measured,
+        predicted_mm=history.rows(model.predict(history)).double().numpy(),
+        actuation=history.rows(history.pressure).double().numpy(),
+        noise_mm=np.full(spec.key_points, math.sqrt(3.0) * noise),
     )
+    return own_level_mm(motion)
 
 
 def _refuse_training_rows(train: list[Recording], held: list[Recording], actuation: str) -> None:

@@ -12,7 +12,7 @@ where the actuation has a corner, a body that lags has one a moment later. Where
 themselves, by as much as the body does, nothing is said.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -48,6 +48,24 @@ SEEN = 0.9
 MOST_ROWS = 60_000
 """Rows that are looked at, the first ones: 50 minutes at 20 Hz. They take about 200 MB for
 nine key points and six chambers."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Measured and predicted motion of a body, N rows."""
+
+    t_s: np.ndarray
+    """(N,) time, s."""
+    run: np.ndarray
+    """(N,) run of each row; the rows of a run stand one after another."""
+    measured_mm: np.ndarray
+    """(N, n, 3) measured key points, mm; NaN where missing."""
+    predicted_mm: np.ndarray
+    """(N, n, 3) predicted key points, mm, in the same frame."""
+    actuation: np.ndarray
+    """(N, m) actuation, in any unit."""
+    noise_mm: np.ndarray
+    """(n,) RMS noise of each measured key point's distance, mm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,22 +106,15 @@ class BodyJumps:
 NONE = Jumps(np.zeros(0, int), np.zeros(0), 0.0)
 
 
-def find_jumps(
-    t_s: np.ndarray,
-    run: np.ndarray,
-    measured_mm: np.ndarray,
-    predicted_mm: np.ndarray,
-    actuation: np.ndarray,
-    noise_mm: np.ndarray,
-) -> Jumps:
-    """The jumps of measured key points (N, n, 3), mm, that predicted ones (N, n, 3), mm, lack.
+def find_jumps(motion: Motion) -> Jumps:
+    """The jumps of the measured key points that the predicted ones lack.
 
-    t_s: (N,) time, s; run: (N,) run of each row, whose rows stand one after another; actuation:
-    (N, m) in any unit; noise_mm: (n,) RMS noise of a key point's distance, mm. NaN stands for a key
-    point that is missing; a row without all of them, but for those that are missing nearly always,
-    has no jump. Samples at the same time, such as steady states, have none, nor have
-    samples whose times are not known.
+    A row in which a key point is missing has no jump; key points that are missing in more than a
+    tenth of the rows do not count. Samples at the same time, such as steady states, have no jumps,
+    nor have samples whose times are not known.
     """
+    t_s, run, actuation = motion.t_s, motion.run, motion.actuation
+    measured_mm, predicted_mm = motion.measured_mm, motion.predicted_mm
     begins = np.flatnonzero(np.diff(run, prepend=run[:1] - 1))
     parts = np.split(np.arange(len(run)), begins[1:])
     steps = np.concatenate([np.zeros(0), *(np.diff(t_s[rows]) for rows in parts)])
@@ -132,7 +143,7 @@ def find_jumps(
     energy = _unexplained(np.where(whole[:, None], measured, 0.0), there, near, whole)
     degrees = measured.shape[1]
     variance = 2.0 * float(np.square(_weights(side)).sum())
-    scale = float(np.square(noise_mm[points]).sum()) * variance
+    scale = float(np.square(motion.noise_mm[points]).sum()) * variance
     for quantile in QUANTILES:
         if whole.any():
             chance = degrees / chi2.ppf(quantile, degrees)
@@ -145,25 +156,18 @@ def find_jumps(
     return Jumps(moments[order], sizes, len(moments) * step / 60.0)
 
 
-def own_level_mm(
-    t_s: np.ndarray,
-    run: np.ndarray,
-    measured_mm: np.ndarray,
-    predicted_mm: np.ndarray,
-    actuation: np.ndarray,
-    noise_mm: np.ndarray,
-) -> float:
+def own_level_mm(motion: Motion) -> float:
     """Level of the jumps that an arm makes by itself, mm; 0 where all have a cause.
 
-    Arguments as for `find_jumps`. Which jumps have a cause depends on what the columns of the
-    actuation show: commands do not show what motors and valves make of them. So where some have
-    none, all jumps of the body count, those with a cause too.
+    Which jumps have a cause depends on what the columns of the actuation show: commands do not show
+    what motors and valves make of them. So where some have none, all jumps of the body count, those
+    with a cause too.
     """
-    found = find_jumps(t_s, run, measured_mm, predicted_mm, actuation, noise_mm)
+    found = find_jumps(motion)
     if not len(found.rows):
         return 0.0
-    still, nothing = np.zeros_like(measured_mm), np.zeros((len(run), 1))
-    every = find_jumps(t_s, run, measured_mm, still, nothing, noise_mm)
+    still = np.zeros_like(motion.measured_mm)
+    every = find_jumps(replace(motion, predicted_mm=still, actuation=still[:, 0, :1]))
     return max(found.level_mm, every.level_mm)
 
 

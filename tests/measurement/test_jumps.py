@@ -1,13 +1,14 @@
 """Jumps of a body against ones that were put into smooth motion, and motion that has none."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from surgisoft.measurement.jumps import BodyJumps, Jumps, find_jumps, own_level_mm
+from surgisoft.measurement.jumps import BodyJumps, Jumps, Motion, find_jumps, own_level_mm
 
 STEP_S = 0.05
 ROWS = 2000
@@ -33,7 +34,7 @@ def looked_at(measured, predicted=None, actuation=None, time=TIME, run=RUN):
     own, points = smooth_motion()
     predicted = points if predicted is None else predicted
     actuation = own if actuation is None else actuation
-    return find_jumps(time, run, measured, predicted, actuation, NOISE)
+    return find_jumps(Motion(time, run, measured, predicted, actuation, NOISE))
 
 
 def held(signal, seconds):
@@ -184,9 +185,9 @@ def test_units_do_not_matter(length, unit):
     actuation, points = smooth_motion()
     measured = points + noise()
     measured[900:] += 0.7
-    one = find_jumps(TIME, RUN, measured, points, actuation, NOISE)
+    one = find_jumps(Motion(TIME, RUN, measured, points, actuation, NOISE))
     other = find_jumps(
-        TIME, RUN, length * measured, length * points, unit * actuation, length * NOISE
+        Motion(TIME, RUN, length * measured, length * points, unit * actuation, length * NOISE)
     )
     assert other.rows.tolist() == one.rows.tolist() == [900]
     assert other.sizes_mm == pytest.approx(length * one.sizes_mm, rel=1e-3)
@@ -197,11 +198,11 @@ def test_of_an_arm_that_jumps_by_itself_all_jumps_count():
     actuation, rows = steps()
     ways = np.array([[3.0, 0.0, -0.5], [0.0, 4.0, -0.5]])
     points = np.array([0.2, 0.6, 1.0])[:, None] * (actuation @ ways)[:, None, :]
-    given = (TIME, RUN), (points, actuation, NOISE)
-    assert own_level_mm(*given[0], points + noise(), *given[1]) == 0.0
+    moved = Motion(TIME, RUN, points + noise(), points, actuation, NOISE)
+    assert own_level_mm(moved) == 0.0
     jumping = points + noise()
     jumping[rows[5] + 30 :] += 0.5
-    found = own_level_mm(*given[0], jumping, *given[1])
+    found = own_level_mm(replace(moved, measured_mm=jumping))
     sizes = np.sort(np.sqrt(np.square(np.diff(points, axis=0)).sum((1, 2)) / 3.0))[::-1]
     assert found == pytest.approx(np.sqrt(np.square(sizes[:10]).mean()), rel=0.1)
     assert found > 1.0

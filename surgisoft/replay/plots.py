@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import rerun.blueprint as rrb
 
 from surgisoft.replay.colours import LIMIT_COLOUR, paler, series_colour
-from surgisoft.tasks.episodes.log import EpisodeLog
-from surgisoft.tasks.episodes.parts import ArmLog
+
+if TYPE_CHECKING:  # their import takes seconds, and the view of a bench has no episode
+    from surgisoft.tasks.episodes.log import EpisodeLog
+    from surgisoft.tasks.episodes.parts import ArmLog
 
 SHARES = ("completion", "visited", "view_fraction", "safe")
 """Measures from 0 to 1, which share one plot."""

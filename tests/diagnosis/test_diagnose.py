@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,7 +23,10 @@ from surgisoft.surrogate.checkpoint import default_arm, load_model, load_trainin
 from surgisoft.surrogate.effects.contact import LEAST_SHARE
 
 
-def recorded(hidden=(), take=3, points=6000):
+@cache
+def recorded(hidden="", take=3, points=3000):
+    """What a robot with a hidden effect of amplitude 1 does; nobody may change it."""
+    hidden = [(hidden, 1.0)] if hidden else []
     rig = VirtualRig(0, take=take, hidden=hidden)
     return rig.record(make_protocol("mixed", rig.limits, points, seed=take))[0]
 
@@ -31,7 +35,7 @@ def recorded(hidden=(), take=3, points=6000):
 def found():
     """Diagnoses of a few robots by what is hidden in them."""
     model, names = default_arm(), ("", "creep", "misalignment", "hysteresis")
-    return {name: diagnose(model, [recorded([(name, 1.0)] if name else [])]) for name in names}
+    return {name: diagnose(model, [recorded(name)]) for name in names}
 
 
 def test_nothing_is_named_on_a_clean_robot(found):
@@ -60,7 +64,7 @@ def test_command_writes_the_promised_json(tmp_path, capsys):
 
     save_model(default_arm(), tmp_path / "arm")
     before = {p.name: p.read_bytes() for p in (tmp_path / "arm").iterdir()}
-    save_recording(recorded([("misalignment", 1.0)], points=3000), tmp_path / "x.parquet")
+    save_recording(recorded("misalignment"), tmp_path / "x.parquet")
     out = tmp_path / "d.json"
     assert (
         run(["diagnose", str(tmp_path / "arm"), str(tmp_path / "x.parquet"), "--json", str(out)])
@@ -101,7 +105,7 @@ def test_a_key_point_that_was_never_measured_is_left_out():
     """The other four and the model's known error name the effect without it."""
     from dataclasses import replace
 
-    recording = recorded([("misalignment", 1.0)])
+    recording = recorded("misalignment")
     points = recording.key_points_mm.copy()
     points[:, 2] = np.nan
     said = diagnose(
@@ -145,7 +149,7 @@ def test_an_effect_that_is_plausible_only_beside_another_is_ranked():
     from surgisoft.diagnosis.residuals import problem_of
     from surgisoft.diagnosis.selection import find
 
-    problem = problem_of(default_arm(), [recorded([("creep", 1.0)], points=3000)], part="training")
+    problem = problem_of(default_arm(), [recorded("creep")], part="training")
     found = find(problem, candidates(problem, ["creep", "misalignment"]), lambda text: None)
     second = next(s for s in found.first if s.effect == "misalignment")
     first = [s for s in found.first if s.effect != "misalignment"]
@@ -170,7 +174,7 @@ def amount_of(found, score, base=()) -> float:
 
 
 def test_what_was_taken_off_the_bench_is_not_named(tmp_path, capsys):
-    said = diagnose(default_arm(), [recorded([("misalignment", 1.0)])], without=["misalignment"])
+    said = diagnose(default_arm(), [recorded("misalignment")], without=["misalignment"])
     assert "misalignment" not in [row.effect for row in said.ranking]
     assert "misalignment" not in said.verdict.effects
     save_recording(recorded(points=1000), tmp_path / "x.parquet")
@@ -302,7 +306,7 @@ def test_all_shares_of_a_diagnosis_are_between_0_and_1(found):
 def test_held_out_rows_change_nothing(found):
     """The training view holds no other key points: a diagnosis is the same whatever they are, and
     so is a second one of the same data."""
-    recording = recorded([("creep", 1.0)])
+    recording = recorded("creep")
     held = held_out_rows([recording])
     assert 0.15 < held.mean() < 0.3
     points = recording.key_points_mm.copy()
@@ -317,7 +321,7 @@ def test_held_out_rows_change_nothing(found):
 
 
 def test_the_final_check_sees_the_held_out_rows_alone():
-    recording = recorded(points=3000)
+    recording = recorded()
     held = held_out_rows([recording])
     check = residual_table(default_arm(), [recording]).final_check()
     np.testing.assert_array_equal(check.index.numpy(), np.flatnonzero(held))

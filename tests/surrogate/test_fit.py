@@ -21,7 +21,8 @@ from surgisoft.surrogate.training import train as train_model
 from tests.surrogate.truth import SPEC, history, shape, traverse, walk
 
 NOISE = 0.05
-QUICK = FitConfig(hidden=(64, 64), epochs=60)
+QUICK = FitConfig(hidden=(64, 64), epochs=60, prior="none")
+"""Of networks without a prior mean, which test_prior_mean.py has."""
 
 
 def rmse(model, judged) -> float:
@@ -45,9 +46,9 @@ def walks():
 
 def test_memory_beats_direction_beats_pressure(walks):
     train, valid, test = walks
-    full = fit(train, valid, SPEC, FitConfig(hidden=(64, 64), epochs=90, effects=("hysteresis",)))
+    full = fit(train, valid, SPEC, replace(QUICK, epochs=90, effects=("hysteresis",)))
     direction = fit(train, valid, SPEC, QUICK)
-    plain = fit(train, valid, SPEC, FitConfig(hidden=(64, 64), epochs=60, inputs="pressure"))
+    plain = fit(train, valid, SPEC, replace(QUICK, inputs="pressure"))
     assert list(full.model.effects) == ["hysteresis"]
     errors = [rmse(result.model, test) for result in (full, direction, plain)]
     assert errors[0] < 0.6 * errors[1]
@@ -63,7 +64,7 @@ def test_nothing_is_added_where_there_is_no_hysteresis():
     """On an arm without memory neither direction nor plays earn a place."""
     rng = np.random.default_rng(2)
     train, valid = (history([walk(400, rng)] * 4, hysteresis=0.0, seed=s) for s in (1, 2))
-    config = FitConfig(hidden=(64, 64), epochs=60, effects=("hysteresis",))
+    config = replace(QUICK, effects=("hysteresis",))
     result = fit(train, valid, SPEC, config)
     assert not result.model.effects
     assert not result.model.network.directions
@@ -117,8 +118,9 @@ def test_missing_key_points_neither_count_nor_spread(walks):
     gappy = pack(
         list(train.t_s), list(train.pressure), list(points)
     )  # four runs of equal length: no padding
-    result = fit(gappy, valid, SPEC, FitConfig(hidden=(64, 64), epochs=60, inputs="pressure"))
-    whole = fit(train, valid, SPEC, FitConfig(hidden=(64, 64), epochs=60, inputs="pressure"))
+    result, whole = (
+        fit(each, valid, SPEC, replace(QUICK, inputs="pressure")) for each in (gappy, train)
+    )
     assert rmse(result.model, test) < 1.1 * rmse(whole.model, test)
 
 
@@ -247,12 +249,12 @@ def runs(seeds, length: int = 150, hysteresis: float = 0.0):
     return history([walk(length, rng) for _ in seeds], hysteresis, NOISE, seed=seeds[0])
 
 
-SMALL = FitConfig(hidden=(32, 32), epochs=60, inputs="pressure", batch=128)
+SMALL = FitConfig(hidden=(32, 32), epochs=60, inputs="pressure", batch=128, prior="none")
 
 
 def test_an_ensemble_knows_its_error_on_runs_that_took_no_part():
     train, fresh = runs(range(12)), runs(range(50, 62))
-    result = fit(train, None, SPEC, replace(SMALL, members=4, prior="none"))
+    result = fit(train, None, SPEC, replace(SMALL, members=4))
     assert isinstance(result.model.network, HawEnsemble)
     interval = result.model.validation.interval
     assert interval.source == "cross-validation"

@@ -176,7 +176,7 @@ def test_an_absurd_actuation_is_refused(walks):
 def test_too_little_held_out_data_decides_nothing(walks):
     """Forty rows are two blocks of time: no stage may be kept on them."""
     valid = history([walk(40, np.random.default_rng(8))])
-    config = FitConfig(hidden=(16,), epochs=20, effects=("hysteresis",))
+    config = replace(QUICK, hidden=(16,), epochs=20, effects=("hysteresis",))
     result = fit(walks[0], valid, SPEC, config)
     assert not result.model.effects
     assert any("too short to decide" in warning for warning in result.warnings)
@@ -225,9 +225,7 @@ def test_a_lag_of_the_line_is_fitted_through_whole_runs():
     train, valid = (
         pack(*([run[k] for run in part] for k in range(3))) for part in (runs[:6], runs[6:])
     )
-    config = FitConfig(
-        inputs="pressure", effects=("line_lag",), hidden=(48, 48), epochs=60, batch=128
-    )
+    config = replace(SMALL, hidden=(48, 48), effects=("line_lag",))
     result = fit(train, valid, SPEC, config)
     stage = result.stages[-1]
     assert stage.kept

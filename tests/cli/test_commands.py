@@ -25,7 +25,7 @@ def lab(tmp_path_factory):
         run(
             [
                 "fit", str(folder / "walk.parquet"), "--valid", str(folder / "validation.parquet"),
-                "--effects", "hysteresis", "--epochs", "100", "--widths", "48,48",
+                "--effects", "hysteresis", "--epochs", "60", "--widths", "48,48",
                 "-o", str(folder / "arm"),
             ]
         )
@@ -40,7 +40,7 @@ def test_fitted_arm_beats_pressure_alone(lab, capsys):
         run(
             [
                 "fit", str(lab / "walk.parquet"), "--valid", str(lab / "validation.parquet"),
-                "--inputs", "pressure", "--epochs", "100", "--widths", "48,48", "-o", plain,
+                "--inputs", "pressure", "--epochs", "60", "--widths", "48,48", "-o", plain,
             ]
         )
         == 0

@@ -47,6 +47,8 @@ network is undertrained; the model is that of another robot; the set-up is wrong
 Models = Literal["default", "alone"]
 """Models that a case is asked of: those of `fit` by default, with a prior mean where it does no
 harm; or networks alone (`--prior none`)."""
+PRIOR: dict[Models, str | None] = {"default": None, "alone": "none"}
+"""Prior mean of these models, as `FitConfig` takes it."""
 
 
 @dataclass(frozen=True)

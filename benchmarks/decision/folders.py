@@ -22,6 +22,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.decision.evidence_log import (
+    PRIOR,
     Label,
     Labelled,
     Models,
@@ -43,8 +44,6 @@ from surgisoft.workers import workers
 FIT_EFFECTS = ("hysteresis",)
 """Effects that a model of a source without models of its own is fitted with, as the robots of the
 benchmark `diagnosis` are."""
-PRIOR: dict[Models, str | None] = {"default": None, "alone": "none"}
-"""Prior mean of the models that are asked."""
 FEW_EPOCHS = 10
 """Epochs of a model that is undertrained, as those of the own rig are."""
 OTHER = "unknown"

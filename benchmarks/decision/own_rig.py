@@ -14,8 +14,10 @@ import numpy as np
 import torch
 
 from benchmarks.decision.evidence_log import (
+    PRIOR,
     Label,
     Labelled,
+    Models,
     append,
     is_stored,
     posed_on,
@@ -99,17 +101,24 @@ def name_of(case: Case, asked: int) -> str:
     return f"{case.robot}/{case.take}/{hidden}/{case.excitation}/model-{asked}"
 
 
-def run_case(case: Case, asked: int, folder: Path, twin: bool = False) -> list[Labelled]:
+def run_case(
+    case: Case, asked: int, folder: Path, twin: bool = False, models: Models = "default"
+) -> list[Labelled]:
     """Record, and collect the evidence; twin: also without the truth among the candidates."""
-    return labelled(case, asked, record(case), folder, twin)
+    return labelled(case, asked, record(case), folder, twin, models)
 
 
 def labelled(
-    case: Case, asked: int, recorded: Recorded, folder: Path, twin: bool = False
+    case: Case,
+    asked: int,
+    recorded: Recorded,
+    folder: Path,
+    twin: bool = False,
+    models: Models = "default",
 ) -> list[Labelled]:
     """Deform the surrogate, and collect the evidence of a recorded case."""
     torch.set_num_threads(1)
-    model = base_model(asked, folder, case.undertrained)
+    model = base_model(asked, folder, case.undertrained, PRIOR[models])
     if case.discrepancy_mm > model.validation.rmse_mm:
         model = bent(model, asked, case.discrepancy_mm, case.take)
     known = model.residuals_on([validation_of(asked)])
@@ -135,6 +144,7 @@ def labelled(
         minutes=EXCITATIONS[case.excitation][1] / 1200.0,
         evidence=evidence,
         seconds=seconds,
+        models=models,
     )
     left_out = without_truth(one, posed) if twin else None
     return [one] if left_out is None else [one, left_out]
@@ -149,17 +159,18 @@ def run(
     processes: int,
     report: Progress,
     twins: bool = False,
+    models: Models = "default",
 ) -> list[Labelled]:
     """Collect the evidence of so many cases; those that the log has are not repeated.
 
     twins: whether every case of a known effect gives one more, without its truth among the
-    candidates.
+    candidates; models: those that are asked.
     """
     done = {one.case: one for one in read(log)}
     drawn = draw(plan, count, seed)
     missing = [pair for pair in drawn if not is_stored(done, name_of(*pair), twins)]
     with workers(processes) as pool:
-        jobs = [pool.submit(run_case, case, asked, folder, twins) for case, asked in missing]
+        jobs = [pool.submit(run_case, *pair, folder, twins, models) for pair in missing]
         for number, job in enumerate(as_completed(jobs)):
             some = job.result()
             append(log, *some)

@@ -39,7 +39,7 @@ class Collected:
     included: Sequence[str] = ()
     """Names of stored sources that otherwise take no part, and are fitted to here."""
     models: Models = "default"
-    """Models that the cases of other sources than the own rig are asked of."""
+    """Models that are asked."""
 
     @property
     def command(self) -> str:
@@ -68,16 +68,17 @@ def run(
 ) -> tuple[list[Labelled], list[Labelled], dict]:
     """(all cases of the fit, those that are judged only, the values of the asset that is fitted).
 
-    work: the evidence of a source that is collected is stored in `work/evidence/NAME.jsonl`, that
-    of the own rig with what was there before. evidence: folder of the stored evidence. keeps:
-    whether what was collected is stored there, too, in the place of its source.
+    work: the evidence of a source that is collected is stored in `work/evidence/FILE.jsonl`
+    (`evidence_log.file_of`), that of the own rig with what was there before. evidence: folder of
+    the stored evidence. keeps: whether what was collected is stored there, too, in its place.
     """
     logs = work / "evidence"
     every, aside = stored(evidence), stored(evidence / JUDGED)
     if new.count:
-        own = logs / f"{own_rig.SOURCE}.jsonl"
-        own_rig.run(new.own, new.count, new.seed, work / "models", own, processes, report, True)
-        every[own_rig.SOURCE] = read(own)  # with those of other seeds
+        file = file_of(own_rig.SOURCE, new.models)
+        log, asked = logs / f"{file}.jsonl", (processes, report, True, new.models)
+        own_rig.run(new.own, new.count, new.seed, work / "models", log, *asked)
+        every[file] = read(log)  # with those of other seeds
     for target, given, fitted in ((every, new.sources, True), (aside, new.judged, False)):
         for name, folder in map(_source, given):
             file = file_of(name, new.models)

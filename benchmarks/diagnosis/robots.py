@@ -31,16 +31,21 @@ GRID_POINTS = 4096
 """Number of steady-state samples to which a base model is fitted."""
 
 
-def base_model(robot: int, folder: Path, undertrained: bool = False) -> ArmModel:
-    """Fitted model of a robot, stored in a folder between uses."""
-    place = folder / f"robot-{robot}{'-undertrained' if undertrained else ''}"
+def base_model(
+    robot: int, folder: Path, undertrained: bool = False, prior: str | None = "none"
+) -> ArmModel:
+    """Fitted model of a robot, stored in a folder between uses.
+
+    prior: its prior mean, as `FitConfig` takes it; None: that of `fit` by default.
+    """
+    kind = "-default" * (prior is None) + "-undertrained" * undertrained
+    place = folder / f"robot-{robot}{kind}"
     if (place / "config.json").is_file():
         return load_model(place)
     rig = VirtualRig(robot)
     train, _ = rig.record(make_protocol("grid", rig.limits, GRID_POINTS, seed=robot))
     valid, _ = rig.record(make_protocol("validation", rig.limits, None, seed=robot))
-    # Without a prior mean, as all models were from which evidence of this rig is stored.
-    config = FitConfig(effects=("hysteresis",), prior="none", seed=robot)
+    config = FitConfig(effects=("hysteresis",), prior=prior, seed=robot)
     if undertrained:
         config = replace(config, epochs=10)
     result = fit(history_of([train]), history_of([valid]), arm_spec([train]), config)

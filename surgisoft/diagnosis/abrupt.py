@@ -20,8 +20,10 @@ from surgisoft.diagnosis.residuals import Problem, ResidualTable
 from surgisoft.diagnosis.statistics import FoldsOfRidge, block_sums
 from surgisoft.measurement.jumps import BodyJumps, Jumps, Motion, find_jumps, own_level_mm
 
-MOMENTS = 96
+MOMENTS = 24
 """Moments that are tried for each key point."""
+FINER = 8
+"""Steps between two of these, in which the best of them is refined."""
 MARGIN = 0.04
 """Share of the rows before the first moment, and behind the last one."""
 RIDGE = 10.0
@@ -110,7 +112,7 @@ def key_point_shift(problem: Problem) -> KeyPointShift | None:
     above = max(square - float(noise.sum()), LEAST_ABOVE * square, 1e-30)
     block = np.unique(problem.block[rows], return_inverse=True)[1]
     fold = problem.fold[problem.block[rows]]
-    behind = (np.linspace(MARGIN, 1.0 - MARGIN, MOMENTS) * len(rows)).astype(int)
+    moments = np.linspace(MARGIN, 1.0 - MARGIN, MOMENTS) * len(rows)
     actuation = _quadratic(problem.pressure[rows])
     ones = np.ones((len(rows), 1), np.float32)
     best: KeyPointShift | None = None
@@ -123,8 +125,9 @@ def key_point_shift(problem: Problem) -> KeyPointShift | None:
         target = residual[:, place].astype(np.float32)
         folds = FoldsOfRidge(columns, target, fold)
         left = folds.remainder(RIDGE)
-        moment = int(np.argmax([_explained(left, first) for first in behind]))
-        (stepped,) = folds.with_breaks(RIDGE, ones, behind[[moment]])
+        first, _ = _best_step(folds, ones, moments)
+        near = first + np.arange(1 - FINER, FINER) / FINER * (moments[1] - moments[0])
+        first, stepped = _best_step(folds, ones, near)
         plain, after = (
             block_sums(np.square(each, dtype=float).sum(1), block) for each in (left, stepped)
         )
@@ -132,26 +135,32 @@ def key_point_shift(problem: Problem) -> KeyPointShift | None:
         gain = float(np.log((plain + floor) / (after + floor)).mean())
         if best is not None and gain <= best.log_gain:
             continue
-        shift = _step(columns, target, behind[moment])
-        part = behind[moment] / len(rows)
+        shift = _step(columns, target, first)
+        part = first / len(rows)
         share = float(np.square(shift).sum()) * part * (1.0 - part) / above
-        row = problem.index.numpy()[rows[behind[moment]]]
+        row = problem.index.numpy()[rows[first]]
         best = KeyPointShift(
             key_point=int(point),
             at_s=float(problem.table.along_s[row]),
             shift_mm=float(np.linalg.norm(shift)),
             share=min(share, 1.0),
-            others=_others(actuation, residual, place, behind[moment]),
+            others=_others(actuation, residual, place, first),
             log_gain=gain,
         )
     return best
 
 
-def _explained(values: np.ndarray, first: int) -> float:
-    """What a step of the mean of values (S, 3) explains of their square, from a row on."""
-    part = first / len(values)
-    gap = values[first:].mean(0) - values[:first].mean(0)
-    return part * (1.0 - part) * float(np.square(gap, dtype=float).sum())
+def _best_step(
+    folds: FoldsOfRidge, ones: np.ndarray, moments: np.ndarray
+) -> tuple[int, np.ndarray]:
+    """First row of the step that leaves least on held-out rows, and what it leaves (S, 3), mm.
+
+    moments: (M,) first rows that are tried, rounded down; ones: (S, 1).
+    """
+    behind = np.unique(moments.astype(int))
+    left = folds.with_breaks(RIDGE, ones, behind)
+    best = int(np.argmin([np.square(each, dtype=float).sum() for each in left]))
+    return int(behind[best]), left[best]
 
 
 def _quadratic(pressure: np.ndarray) -> np.ndarray:

@@ -542,9 +542,10 @@ def result_of(found: Findings, decision: Decision | None = None) -> Diagnosis:
         sentence += (
             f"; {' or '.join(others)} explains the recordings about as well as one of the two"
         )
+    recordings = len(problem.table.names)
     if kind == "unknown_effect":
-        sentence += knock(evidence) + periodic(evidence)
-    told = slipped(evidence, len(problem.table.names))
+        sentence += knock(evidence, recordings) + periodic(evidence)
+    told = slipped(evidence, recordings)
     if not told or evidence.jump_count > 1:
         told += jumping(evidence)
     if kind == "unknown_effect":
@@ -622,15 +623,17 @@ def _instead(evidence: Evidence) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for name, margin in both if margin < AS_GOOD))
 
 
-def knock(evidence: Evidence) -> str:
+def knock(evidence: Evidence, recordings: int = 1) -> str:
     """End of the sentence on an unknown effect: that it may be a knock of the base, or empty.
 
-    Said where a turn at one moment is better than the best effect by 5 %, one-sided.
+    Said where a turn at one moment is better than the best effect by 5 %, one-sided. recordings:
+    how many there are.
     """
     if evidence.sudden_margin <= AS_GOOD:
         return ""
     best = evidence.proposals[0].effects[0]
-    return f"; a turn of the whole body at one moment, as by a knock, explains more than {best}"
+    when = f"{evidence.sudden_at_s:.3g} s" + " (all recordings in turn)" * (recordings > 1)
+    return f"; a turn of the whole body at {when}, as by a knock, explains more than {best}"
 
 
 def _reached(found: Findings, effects: tuple[str, ...], kind: Kind) -> list[float]:

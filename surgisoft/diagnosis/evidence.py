@@ -19,7 +19,7 @@ from surgisoft.diagnosis.selection import Findings, ModelSelection, Score, Selec
 from surgisoft.diagnosis.statistics import block_sums, studentised, variance_between
 from surgisoft.surrogate.effects import hypothesis_of, known_effects
 
-VERSION = 5
+VERSION = 6
 """Version of the evidence, raised when a number gets another meaning: stored evidence of another
 version is collected again."""
 INDEPENDENT = 6.0
@@ -182,6 +182,9 @@ class Evidence:
     where that is an effect that moves the base; 0 elsewhere."""
     sudden_margin: float = 0.0
     """Studentised mean over motions of that log gain."""
+    sudden_at_s: float = 0.0
+    """Moment of that turn, s, all recordings in turn; 0 where none was sought, and in stored
+    evidence that does not have it."""
     jumps: float = 0.0
     """RMS size of the ten largest jumps of the body that neither the actuation nor the predicted
     motion has, beyond those before the change, over the RMS error above the noise (`abrupt`)."""
@@ -240,7 +243,7 @@ def evidence_of(found: Findings) -> Evidence:
     above = selection.explainable(raw, [free])
     beside = selection.explainable(null, [box.losses, *(s.losses for s in found.first)])
     beyond = beyond_history(problem, box.features)
-    sudden = sudden_log_gain(found)
+    sudden, sudden_at_s = sudden_gain(found)
     stated = problem.discrepancy_mm**2 + problem.noise_mm**2
     validated = float((seen.sum(0) * stated).sum())
     return Evidence(
@@ -266,6 +269,7 @@ def evidence_of(found: Findings) -> Evidence:
         line_hz=beyond.line_hz,
         sudden_log_gain=float(sudden.mean()),
         sudden_margin=_margin(found, sudden),
+        sudden_at_s=sudden_at_s,
         **abrupt_changes(problem),
     )
 
@@ -286,19 +290,21 @@ def abrupt_changes(problem: Problem) -> dict[str, Any]:
     }
 
 
-def sudden_log_gain(found: Selected) -> np.ndarray:
-    """(B,) log gain of a sudden turn of the whole body over the best single proposal.
+def sudden_gain(found: Selected) -> tuple[np.ndarray, float]:
+    """(B,) log gain of a sudden turn of the body over the best single proposal; its moment, s.
 
-    0 where that is no effect that moves the base. Neither contains the other, so its studentised
-    mean decides between the two (Vuong 1989, "Likelihood ratio tests for model selection and
-    non-nested hypotheses").
+    Both are 0 where that is no effect that moves the base. Neither contains the other, so the
+    studentised mean of the log gain decides between the two (Vuong 1989, "Likelihood ratio tests
+    for model selection and non-nested hypotheses").
     """
     selection, best = found.selection, found.proposals[:1]
     known = known_effects()
     if not any(hypothesis_of(known[name]).moves_base for one in best for name in one.effects):
-        return np.zeros(len(selection.floor))
+        return np.zeros(len(selection.floor)), 0.0
     sudden = sudden_turn(selection.validation.split, selection.problem.predicted)
-    return selection.log_ratio(selection.losses(best[0].chosen), sudden.losses)
+    rows = found.problem.index.numpy()
+    at_s = float(found.problem.table.along_s[rows[int(sudden.at * len(rows))]])
+    return selection.log_ratio(selection.losses(best[0].chosen), sudden.losses), at_s
 
 
 def _share(part: float, whole: float) -> float:

@@ -8,7 +8,7 @@ import pytest
 from surgisoft.diagnosis.beyond_history import RIDGES, beyond_history, sudden_turn
 from surgisoft.diagnosis.candidates import candidates
 from surgisoft.diagnosis.cross_validation import split_of
-from surgisoft.diagnosis.evidence import sudden_log_gain
+from surgisoft.diagnosis.evidence import sudden_gain
 from surgisoft.diagnosis.residuals import problem_of
 from surgisoft.diagnosis.selection import select
 from surgisoft.diagnosis.statistics import BREAK_RIDGE, studentised
@@ -127,12 +127,16 @@ def test_what_is_there_from_the_beginning_is_no_sudden_turn():
 
 def test_a_knock_is_better_explained_by_a_turn_at_one_moment_and_a_drift_is_not():
     """Beside misalignment and drift, which both imitate it."""
-    time, margins = np.arange(ROWS) / ROWS, []
+    time, margins, moments = np.arange(ROWS) / ROWS, [], []
     for shape in (time > 0.4, 1.0 - np.exp(-4.0 * time)):
         problem = turned_body(0.05 * shape)
         found = select(problem, candidates(problem, ["misalignment", "drift"]), lambda text: None)
-        margins.append(studentised(problem.by_motion(sudden_log_gain(found)[None]))[0])
+        gain, at_s = sudden_gain(found)
+        margins.append(studentised(problem.by_motion(gain[None]))[0])
+        moments.append(at_s)
     assert margins[0] > 3.0
+    # The training rows are the first three quarters, and two fifths of the recording lie before.
+    assert moments[0] == pytest.approx(0.4 * ROWS * PERIOD_S, abs=0.03 * ROWS * PERIOD_S)
     assert margins[1] < -3.0
 
 
@@ -140,4 +144,6 @@ def test_an_effect_of_the_actuation_is_compared_with_no_sudden_turn():
     pressure = walk(ROWS)
     problem = problem_of(still_model(), [recording(0.1 * pressure[:, 0], pressure)])
     found = select(problem, candidates(problem, ["payload"]), lambda text: None)
-    assert not sudden_log_gain(found).any()
+    gain, at_s = sudden_gain(found)
+    assert not gain.any()
+    assert at_s == 0.0

@@ -227,10 +227,12 @@ def test_a_knock_is_told_where_a_turn_at_one_moment_explains_more(found):
     assert turned.sudden_margin < 0.0
     assert knock(turned) == ""
     assert found["creep"].statistics.sudden_log_gain == 0.0
+    assert found["creep"].statistics.sudden_at_s == 0.0
     defined = {row.effect for row in turned.effects if row.by_definition}
     assert defined == {"misalignment", "gain_mismatch"}
-    told = knock(replace(turned, sudden_margin=3.0))
-    assert told.endswith("at one moment, as by a knock, explains more than misalignment")
+    sudden = replace(turned, sudden_margin=3.0, sudden_at_s=83.04)
+    assert knock(sudden).endswith(" at 83 s, as by a knock, explains more than misalignment")
+    assert " at 83 s (all recordings in turn), as by" in knock(sudden, recordings=2)
 
 
 def test_what_is_missing_has_one_amplitude_and_a_check_says_so_where_it_has_not(found):

@@ -31,6 +31,8 @@ RIDGES = (0.5, 5.0, 50.0)
 to the weight of as many rows. The best on held-out blocks is taken."""
 BREAKS = 24
 """Moments that are tried. The nearest one is off by a fiftieth of the time at most."""
+FINER = 8
+"""Steps between two of these, in which the moment of a sudden turn is refined."""
 MARGIN = 0.04
 """Share of the rows before the first moment, and behind the last one."""
 LEAST_PERIODS = 4.0
@@ -95,9 +97,9 @@ class SuddenTurn:
     """A rigid turn and shift of the whole body that sets in at one moment."""
 
     losses: np.ndarray
-    """(B,) held-out sum of squared distances by block with the best one, mm^2."""
+    """(B,) held-out sum of squared distances by block with the best of BREAKS moments, mm^2."""
     at: float
-    """Its place, as a share of the rows, 0 to 1."""
+    """Its place, as a share of the rows, 0 to 1, refined between the neighbours of that moment."""
 
 
 def sudden_turn(split: Split, points: np.ndarray) -> SuddenTurn:
@@ -110,12 +112,26 @@ def sudden_turn(split: Split, points: np.ndarray) -> SuddenTurn:
     turned = np.cross(axes, points[:, :, None, :])  # (S, n, 3 axes, 3)
     rigid = np.concatenate([turned, np.broadcast_to(axes, turned.shape)], axis=2).swapaxes(2, 3)
     places = np.linspace(MARGIN, 1.0 - MARGIN, BREAKS)
-    behind = [np.arange(len(points)) >= int(place * len(points)) for place in places]
-    parts = [rigid * each[:, None, None, None] for each in behind]
-    validation, size = CrossValidation.on(split, np.concatenate(parts, axis=3)), rigid.shape[3]
-    losses = [validation.losses(range(n * size, (n + 1) * size)) for n in range(BREAKS)]
+    place, losses = _best_moment(split, rigid, places)
+    near = place + np.arange(1 - FINER, FINER) / FINER * (places[1] - places[0])
+    place, _ = _best_moment(split, rigid, np.clip(near, MARGIN, 1.0 - MARGIN))
+    return SuddenTurn(losses, place)
+
+
+def _best_moment(
+    split: Split, sensitivities: np.ndarray, places: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """The place from which on sensitivities (S, n, 3, k), mm, leave least; what is left (B,), mm^2.
+
+    places: shares of the rows, 0 to 1, that are tried.
+    """
+    rows, size = len(sensitivities), sensitivities.shape[3]
+    behind = [np.arange(rows) >= int(place * rows) for place in places]
+    parts = [sensitivities * each[:, None, None, None] for each in behind]
+    validation = CrossValidation.on(split, np.concatenate(parts, axis=3))
+    losses = [validation.losses(range(n * size, (n + 1) * size)) for n in range(len(places))]
     best = int(np.argmin([each.sum() for each in losses]))
-    return SuddenTurn(losses[best], float(places[best]))
+    return float(places[best]), losses[best]
 
 
 def strongest_line(problem: Problem, remainder: np.ndarray) -> tuple[float, float]:

@@ -218,8 +218,8 @@ def decision(
     models: Annotated[
         Literal["default", "alone"],
         typer.Option(
-            help="Models that the cases of --cases and --judge are diagnosed with: default, as fit "
-            "makes them; alone, networks without a prior mean."
+            help="Models that the collected cases are diagnosed with: default, as fit makes them; "
+            "alone, networks without a prior mean."
         ),
     ] = "default",
     robots: Robots = "200,201,202,203,204,205",

@@ -632,7 +632,7 @@ def knock(evidence: Evidence, recordings: int = 1) -> str:
     if evidence.sudden_margin <= AS_GOOD:
         return ""
     best = evidence.proposals[0].effects[0]
-    when = f"{evidence.sudden_at_s:.3g} s" + " (all recordings in turn)" * (recordings > 1)
+    when = f"{evidence.sudden_at_s:.0f} s" + " (all recordings in turn)" * (recordings > 1)
     return f"; a turn of the whole body at {when}, as by a knock, explains more than {best}"
 
 
@@ -674,7 +674,7 @@ def slipped(evidence: Evidence, recordings: int = 1) -> list[str]:
     """
     if evidence.shift < CLEAR_SHIFT:
         return []
-    when = f"{evidence.shift_at_s:.3g} s on" + ", all recordings in turn" * (recordings > 1)
+    when = f"{evidence.shift_at_s:.0f} s on" + ", all recordings in turn" * (recordings > 1)
     return [
         f"key point k{evidence.shift_key_point} is shifted by {evidence.shift_mm:.3g} mm against "
         f"the others from {when}: its marker has probably slipped, so use the rows before that "

@@ -233,6 +233,7 @@ def test_a_knock_is_told_where_a_turn_at_one_moment_explains_more(found):
     sudden = replace(turned, sudden_margin=3.0, sudden_at_s=83.04)
     assert knock(sudden).endswith(" at 83 s, as by a knock, explains more than misalignment")
     assert " at 83 s (all recordings in turn), as by" in knock(sudden, recordings=2)
+    assert " at 1234 s, as by" in knock(replace(sudden, sudden_at_s=1234.0))
 
 
 def test_what_is_missing_has_one_amplitude_and_a_check_says_so_where_it_has_not(found):

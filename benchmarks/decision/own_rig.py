@@ -26,7 +26,7 @@ from benchmarks.decision.evidence_log import (
     without_truth,
 )
 from benchmarks.diagnosis.cases import EXCITATIONS, KNOWN, MEMORY, PAIRS, UNKNOWN, Case
-from benchmarks.diagnosis.robots import Recorded, base_model, bent, record, validation_of
+from benchmarks.diagnosis.robots import base_model, bent, record, validation_of
 from surgisoft.progress import Progress
 from surgisoft.workers import workers
 
@@ -104,20 +104,12 @@ def name_of(case: Case, asked: int) -> str:
 def run_case(
     case: Case, asked: int, folder: Path, twin: bool = False, models: Models = "default"
 ) -> list[Labelled]:
-    """Record, and collect the evidence; twin: also without the truth among the candidates."""
-    return labelled(case, asked, record(case), folder, twin, models)
+    """Record, deform the surrogate, and collect the evidence.
 
-
-def labelled(
-    case: Case,
-    asked: int,
-    recorded: Recorded,
-    folder: Path,
-    twin: bool = False,
-    models: Models = "default",
-) -> list[Labelled]:
-    """Deform the surrogate, and collect the evidence of a recorded case."""
+    twin: also without the truth among the candidates; models: those that are asked.
+    """
     torch.set_num_threads(1)
+    recorded = record(case)
     model = base_model(asked, folder, case.undertrained, PRIOR[models])
     if case.discrepancy_mm > model.validation.rmse_mm:
         model = bent(model, asked, case.discrepancy_mm, case.take)

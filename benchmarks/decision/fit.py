@@ -2,11 +2,12 @@
 
 Each model is fitted by penalised maximum likelihood (ridge: le Cessie & van Houwelingen 1992;
 sign constraints by bounded L-BFGS: Byrd et al. 1995). Every source counts alike, but for one of few
-cases; pairs have a stated share of every source (PRIORS). The penalty of each model is chosen by
-leaving out one source after another, and one group of robots after another, within the cases that
-it is fitted to. Robots left out inside the same cases also give the curves that calibrate the first
-effect and the set of two (Platt 1999). So nothing of a source that is judged enters any choice. The
-costs of wrong results are stated (`surgisoft.diagnosis.criteria.Worth`).
+cases; pairs have a stated share of every source (PRIORS), and in `first` every effect counts alike.
+The penalty of each model is chosen by leaving out one source after another, and one group of robots
+after another, within the cases that it is fitted to. Robots left out inside the same cases also
+give the curves that calibrate the first effect and the set of two (Platt 1999). So nothing of a
+source that is judged enters any choice. The costs of wrong results are stated
+(`surgisoft.diagnosis.criteria.Worth`).
 """
 
 import datetime
@@ -90,7 +91,10 @@ def sample(name: str, cases: Sequence[Labelled]) -> list[tuple[np.ndarray, np.nd
             pair = [one.effects for one in case.evidence.proposals if len(one.effects) == 2]
             if case.label != "known" or not pair or case.size < WEAK:
                 continue
-            right = np.array(float(len(case.truth) == 2 and set(pair[0]) == set(case.truth)))
+            hit = set(pair[0]) & set(case.truth)
+            if not hit:
+                continue
+            right = np.array(float(len(hit) == 2))
         else:
             names = [one.effect for one in case.evidence.effects]
             right = np.array([float(one in case.truth) for one in names])
@@ -125,7 +129,25 @@ def case_weights(name: str, some: Sequence, twin: float = 1.0) -> np.ndarray:
     share = {True: 1.0 if prior is None else prior, False: 0.0 if prior is None else 1.0 - prior}
     each = [share[kind[1]] * units.sum() / sources / max(number[kind], 1e-9) for kind in kinds]
     weights = np.minimum(np.array(each, float), MOST_WEIGHT) * units
+    if name == "first":
+        weights = _even_over_effects(weights, [case for _, _, case in some])
     return weights * units.sum() / weights.sum()
+
+
+def _even_over_effects(weights: np.ndarray, cases: Sequence[Labelled]) -> np.ndarray:
+    """(N,) weights with which every effect counts alike, and every source as before.
+
+    How often an effect was drawn as missing says nothing of real arms, and would enter its prior
+    weight. A case of two effects has the mean weight of both.
+    """
+    number = Counter(name for case in cases for name in case.truth)
+    even = np.array([np.mean([1.0 / number[name] for name in case.truth]) for case in cases])
+    even = weights * np.minimum(even / even.mean(), MOST_WEIGHT)
+    sources = np.array([case.source for case in cases])
+    for source in np.unique(sources):
+        own = sources == source
+        even[own] *= weights[own].sum() / even[own].sum()
+    return even
 
 
 def log_losses(name: str, model: Logistic, some: Sequence) -> np.ndarray:
@@ -155,7 +177,7 @@ def _padded(some: Sequence) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def fit_one(name: str, some: Sequence, penalty: float, twin: float = 1.0) -> Logistic:
     """One logistic model of given penalty and weight of the cases without their truth."""
     features = FEATURES[name]
-    signs = np.array([feature.sign for feature in features], float)
+    signs = [feature.sign for feature in features]
     some = [one for one in some if twin > 0.0 or not one[2].left_out]
     if not some:
         return Logistic(tuple(0.0 for _ in features))
@@ -187,9 +209,9 @@ def fit_one(name: str, some: Sequence, penalty: float, twin: float = 1.0) -> Log
         slope[-1] += off.sum()
         return float(total), slope
 
-    bounds = [(0.0, None) if sign > 0 else (None, 0.0) for sign in signs]
+    bounds = [(0.0 if sign > 0 else None, 0.0 if sign < 0 else None) for sign in signs]
     bounds.append((0.0, 0.0) if joint else (None, None))
-    start = np.append(0.1 * signs, 0.0)
+    start = np.append(0.1 * np.array(signs, float), 0.0)
     found = optimize.minimize(
         loss,
         start,

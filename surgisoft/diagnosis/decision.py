@@ -7,14 +7,16 @@ probabilities:
 - `known`: what is missing is in the list, given that something is;
 - `first`: which effect of the list it is, given that it is in the list: a conditional logit over
   all effects (McFadden 1974), P(e) proportional to exp(w . x_e);
-- `two`: the two proposed effects are both missing, given that what is missing is in the list;
+- `two`: the two proposed effects are both missing, given that one of them is;
 - `network`: the model is off, undertrained or that of another arm, given that no effect of the list
   is missing; not asked of a paired difference, which has no error of a model in it.
 
-So P(e) = P(missing) P(known) P(e | known). Every weight has a fixed sign: more evidence for a
-statement never makes it less probable. The probabilities of the most probable effect and of the
-two most probable ones are products of three fits; two curves calibrate them (Platt 1999), and what
-remains to 1 is shared by the others as before. Each statement that could be made has one
+So P(e) = P(missing) P(known) P(e | known), and two effects e and f are both missing with the
+probability (P(e) + P(f)) P(both | one of them). Every weight of a feature has a fixed sign: more
+evidence for a statement never makes it less probable. Only the prior weights of the effects
+(`PRIOR_EFFECTS`) may have either. The probabilities of the most probable effect and of the two most
+probable ones are products of three fits; two curves calibrate them (Platt 1999), and what remains
+to 1 is shared by the others as before. Each statement that could be made has one
 probability (`Statement`), and the result is the one whose worth to its reader, weighed with it, is
 largest (`criteria.Worth`; Savage 1954). "Cannot tell" is worth 0 (Chow 1970: a statement that is
 not made), so it is the result only where no statement is probable enough. Weights, curves, sources
@@ -58,7 +60,7 @@ Reason = Literal["network", "learned", "repeatability", "few_data", "schedule"]
 what is missing; how well recordings of an unchanged arm agree is not known well enough; there are
 too few motions; the schedule does not tell effects apart."""
 
-SCHEMA = 6
+SCHEMA = 7
 """Version of the asset's format and of the features: weights belong to the features that they were
 fitted with, so an asset of another version is fitted again."""
 ASSET = Path(__file__).parents[1] / "assets" / "decision" / "decision.json"
@@ -80,6 +82,25 @@ FORM_SHARE = 0.02
 """Share of what an effect explains that its formula gets wrong on a real arm: two effects whose
 changes differ by less are not told apart by how sure the blocks are, and a second one that explains
 less besides is not told from the first one's form."""
+PRIOR_EFFECTS = (
+    "hysteresis",
+    "creep",
+    "line_lag",
+    "rate_dependence",
+    "dead_zone",
+    "drift",
+    "coupling",
+    "gain_mismatch",
+    "misalignment",
+    "payload",
+    "contact",
+    "softening",
+    "stiffening",
+    "twist",
+)
+"""Effects with a fitted prior weight: those that are missing in cases of the fit. It says how often
+an effect is the cause where it explains as much as others. Some imitate many causes and seldom are
+it; softening and twist imitate few. Every other effect, such as a user's own, has the weight 0."""
 CLEAR_JUMPS = 0.2
 """Level of new jumps over the error (`Evidence.jumps`) that counts in full, and from which on they
 are mentioned. The inner loss of the fits is flat about it (docs/results/decision.md)."""
@@ -101,7 +122,8 @@ class Feature:
     name: str
     """Its name in the asset."""
     sign: int
-    """+1: more of it makes the statement more probable; -1: less probable."""
+    """+1: more of it makes the statement more probable; -1: less probable; 0: its weight may have
+    either sign."""
     of: Callable[..., float]
     """Computes it from the evidence; for `first` from an effect's evidence and all of it."""
     meaning: str
@@ -187,14 +209,34 @@ def _shift(evidence: Evidence) -> float:
     return _between(evidence.shift / CLEAR_SHIFT, 0.0, 1.0)
 
 
-def lack_of_fit(gain: float | None, log_gain: float | None) -> float:
-    """Geometric mean of gain and log gain of relaxed forms, each at most 1; 0 where either falls.
+def _static_share(evidence: Evidence) -> float:
+    """What any static function explains over what a black box with memory explains, at most 1.
 
-    Few blocks that fall by much and many that fall by little both count.
+    Where nothing is missing, what a model leaves is mostly what it did not learn of the arm's
+    memory.
     """
-    if gain is None or log_gain is None:
+    return _between(evidence.free_static / max(evidence.free_box, LEAST_EXPLAINED), 0.0, 1.0)
+
+
+def _distinct(evidence: Evidence) -> float:
+    """Log of what the third best effect leaves over what the best one leaves; 0 without one.
+
+    An effect that is missing stands out, with a relative of it perhaps. Of noise all explain alike.
+    """
+    return _between(evidence.effects[2].left, -0.5, 1.0) if len(evidence.effects) > 2 else 0.0
+
+
+def _uneven(evidence: Evidence) -> float:
+    """Share that the best effect leaves in a block (geometric mean) less the share that it leaves
+    of the whole squared error.
+
+    A missing effect reduces the error of most blocks alike. One that only imitates the cause
+    reduces that of a few blocks with large errors.
+    """
+    best = _best(evidence)
+    if best is None:
         return 0.0
-    return math.sqrt(_between(gain, 0.0, 1.0) * _between(log_gain, 0.0, 1.0))
+    return _between(math.exp(-best.log_gain) - (1.0 - min(best.gain, 1.0)), -1.0, 1.0)
 
 
 def _of_box(evidence: Evidence) -> float:
@@ -206,16 +248,6 @@ def _of_box(evidence: Evidence) -> float:
 def _stays(evidence: Evidence) -> float:
     """Log of the error above the floor that the best proposal leaves over the whole of it."""
     return _log(_left_size(evidence) / max(evidence.size, 1e-3), -3.0, 0.0)
-
-
-def _most_lack_of_fit(evidence: Evidence) -> float:
-    """Log of the largest lack of fit of a proposal over what a formula gets wrong, over 3.
-
-    On a log scale, because a formula that is right leaves its relaxed form next to nothing to
-    explain: a lack of fit of 0.2 is ten times what it may be, and not a fifth of the worst.
-    """
-    some = [lack_of_fit(each.form_gain, each.form_log_gain) for each in _beyond_chance(evidence)]
-    return math.log1p(max(some, default=0.0) / FORM_SHARE) / 3.0
 
 
 def _definition_z(evidence: Evidence) -> float:
@@ -294,6 +326,30 @@ def _instead_left(evidence: Evidence) -> float:
     return _between(math.log(min(some)), 0.0, 1.0) if some else 1.0
 
 
+def _unique_share(effect: EffectEvidence, evidence: Evidence) -> float:
+    """Gain that returns when an effect is left out of all effects together, over the sum of these.
+
+    Effects that do nearly the same return little each, however large the error; what one of them
+    returns over all others says whether the data need it.
+    """
+    each = [_between(one.unique, 0.0, 1.0) for one in evidence.effects]
+    return _between(effect.unique, 0.0, 1.0) / (sum(each) + LEAST_LEFT)
+
+
+def _least_unique(evidence: Evidence) -> float:
+    """The lesser unique share of two proposed effects; 0 where there are none."""
+    pair = _pair(evidence)
+    own = [each for each in evidence.effects if pair and each.effect in pair.effects]
+    return min((_unique_share(each, evidence) for each in own), default=0.0)
+
+
+def _prior(name: str) -> "Feature":
+    """The feature that is 1 for the effect of a name."""
+    return Feature(
+        f"prior_{name}", 0, lambda x, e: float(x.effect == name), f"1 for `{name}`, 0 for others"
+    )
+
+
 def _leaves_more(effect: EffectEvidence, evidence: Evidence) -> float:
     """Log of what an effect leaves over what the best one leaves, over 2, as shares.
 
@@ -323,13 +379,6 @@ def _proposed(effect: EffectEvidence, evidence: Evidence) -> float:
     own = any(effect.effect in each.effects for each in evidence.proposals[1:])
     gain = _between(_last(evidence, "own_gain"), 0.0, 1.0) * _z(_last(evidence, "own_z"))
     return own * gain * _beyond_form(evidence)
-
-
-def _single_lack_of_fit(evidence: Evidence) -> float:
-    if not evidence.proposals:
-        return 0.0
-    one = evidence.proposals[0]
-    return lack_of_fit(one.form_gain, one.form_log_gain)
 
 
 JUMPS_MEANS = "level of the body's new jumps that the actuation does not have, over the error"
@@ -375,12 +424,6 @@ MISSING = (
         "share that a black box with memory explains beyond any static function",
     ),
     Feature(
-        "over_validated",
-        +1,
-        lambda e: _log(e.error_over_validated, -1.0, 2.0),
-        "log of the error over the validated error",
-    ),
-    Feature(
         "size",
         +1,
         lambda e: _log(e.size, -1.0, 2.0),
@@ -397,6 +440,18 @@ MISSING = (
         -1,
         _stays,
         "log of the share of the error above the floor that the best proposal leaves",
+    ),
+    Feature(
+        "static",
+        +1,
+        _static_share,
+        "share of what a black box with memory explains that any static function explains",
+    ),
+    Feature(
+        "distinct",
+        +1,
+        _distinct,
+        "log of what the third best effect leaves over what the best one leaves",
     ),
     Feature(
         "break",
@@ -444,13 +499,6 @@ KNOWN = (
         "log of the error that the best proposal leaves, over the validated error",
     ),
     Feature(
-        "lack_of_fit",
-        -1,
-        _most_lack_of_fit,
-        "log of what relaxed forms of a proposal explain besides (root of gain x log gain), over "
-        "what a formula gets wrong",
-    ),
-    Feature(
         "form_z",
         -1,
         lambda e: _z(_most(e, "form_z", 0.0)),
@@ -474,6 +522,12 @@ KNOWN = (
         +1,
         lambda e: _z(e.effects[0].z) if e.effects else 0.0,
         "normal quantile of the best effect's family-wise p-value",
+    ),
+    Feature(
+        "uneven",
+        -1,
+        _uneven,
+        "what the best effect leaves in a block on average over what it leaves of the whole error",
     ),
     *BEYOND_HISTORY,
     Feature(
@@ -504,8 +558,8 @@ FIRST = (
     Feature(
         "unique",
         +1,
-        lambda x, e: _between(x.unique, 0.0, 1.0),
-        "share that returns when it is left out of all effects together",
+        _unique_share,
+        "share that returns when it is left out of all effects together, over the sum of them",
     ),
     Feature(
         "proposed",
@@ -514,16 +568,10 @@ FIRST = (
         "for one of the two proposed effects what the second explains beside the relaxed first",
     ),
     Feature(
-        "lack_of_fit",
-        -1,
-        lambda x, e: lack_of_fit(x.form_gain, x.form_log_gain),
-        "what its relaxed form explains besides",
-    ),
-    Feature(
         "amplitudes",
         -1,
-        lambda x, e: _log(x.size, 0.0, 3.0) * _between(1.0 - x.left, 0.0, 1.0),
-        "log of its number of amplitudes, where it explains about as much as the best",
+        lambda x, e: _log(x.size + 1, 0.0, 4.0),
+        "log(1 + its number of amplitudes)",
     ),
     Feature(
         "exact_left",
@@ -535,6 +583,7 @@ FIRST = (
         ),
         "size of what an effect of exact form leaves",
     ),
+    *(_prior(name) for name in PRIOR_EFFECTS),
 )
 TWO = (
     Feature(
@@ -559,12 +608,6 @@ TWO = (
         "share that the second explains beside the relaxed form of the first, beyond its form",
     ),
     Feature(
-        "own_z",
-        +1,
-        lambda e: _z(_last(e, "own_z")),
-        "normal quantile of the second's p-value there",
-    ),
-    Feature(
         "own_log_gain",
         +1,
         lambda e: _between(_last(e, "own_log_gain"), 0.0, 1.0) * _beyond_form(e),
@@ -583,37 +626,20 @@ TWO = (
         "studentised log gain of the two over it",
     ),
     Feature(
-        "explained",
+        "unique",
         +1,
-        lambda e: _between(_last(e, "gain"), 0.0, 1.0),
-        "share of what can be explained by the two",
+        _least_unique,
+        "the lesser of the two effects' unique shares",
     ),
     Feature(
-        "single_lack_of_fit",
-        +1,
-        _single_lack_of_fit,
-        "what the relaxed form of the best single effect explains besides",
+        "log_gain",
+        -1,
+        lambda e: _between(e.effects[0].log_gain, 0.0, 2.0) if e.effects else 0.0,
+        "log gain of the best effect: the more there is to mend of its formula, the less a second "
+        "one says",
     ),
 )
 NETWORK = (
-    Feature(
-        "above_floor",
-        +1,
-        lambda e: _log(e.error_over_floor, 0.0, 3.0),
-        "log of the error over the noise floor",
-    ),
-    Feature(
-        "static",
-        +1,
-        lambda e: _between(e.free_static, 0.0, 1.0),
-        "share of what can be explained by any static function",
-    ),
-    Feature(
-        "over_validated",
-        +1,
-        lambda e: abs(_log(e.error_over_validated, -1.0, 2.0)),
-        "log of the error over the validated error, its absolute value",
-    ),
     Feature(
         "over_box",
         +1,
@@ -804,7 +830,8 @@ def probabilities(evidence: Evidence, model: DecisionModel | None = None) -> Pro
         share /= share.sum()
     each = {one.effect: float(p) for one, p in zip(evidence.effects, share, strict=True)}
     pair = [one.effects for one in evidence.proposals if len(one.effects) == 2]
-    both = chance("two") if pair else 0.0
+    one = min(sum(each.get(name, 0.0) for name in pair[0]), 1.0) if pair else 0.0
+    both = one * chance("two") if pair else 0.0
     ordered = sorted(each.items(), key=lambda item: -item[1])
     found = Probabilities(
         nothing=(1.0 - missing) * (1.0 - network),

@@ -48,6 +48,7 @@ from surgisoft.diagnosis.criteria import CLAIM, WORTH, Claim, Worth
 from surgisoft.diagnosis.decision import (
     ASSET,
     FEATURES,
+    PRIOR_EFFECTS,
     Curve,
     Decision,
     Logistic,
@@ -171,6 +172,51 @@ def test_how_often_pairs_were_drawn_does_not_count():
     weights = case_weights("two", drawn("a", 10, 10) + drawn("b", 10, 30))
     assert weights[:10].sum() / weights[:20].sum() == pytest.approx(PRIORS["two"])
     assert weights[20:30].sum() / weights[20:].sum() == pytest.approx(PRIORS["two"])
+
+
+def test_every_effect_counts_alike_in_which_one_it_is():
+    """Nine cases of creep and three of a lag have one weight each; a source of few keeps its own."""
+    names = 9 * ["creep"] + 3 * ["line_lag"]
+    some = [case(n, truth=(name,)) for n, name in enumerate(names)]
+    rows = [(np.zeros((2, 1)), np.array([1.0, 0.0]), one) for one in some]
+    weights = case_weights("first", rows)
+    assert weights[:9].sum() == pytest.approx(weights[9:].sum())
+    other = [case(n, "b", truth=("creep",)) for n in range(12)]
+    both = rows + [(np.zeros((2, 1)), np.array([1.0, 0.0]), one) for one in other]
+    weights = case_weights("first", both)
+    assert weights[:12].sum() == pytest.approx(weights[12:].sum())
+
+
+def test_two_effects_are_asked_about_where_one_of_them_is_missing():
+    pair = replace(GOOD, proposals=(ALONE, replace(ALONE, effects=("creep", "line_lag"))))
+    truths = (("creep", "line_lag"), ("creep",), ("drift",), ("line_lag", "drift"))
+    some = sample("two", [case(n, truth=truth, evidence=pair) for n, truth in enumerate(truths)])
+    assert [(one.case, float(right)) for _, right, one in some] == [("0", 1), ("1", 0), ("3", 0)]
+
+
+def test_an_effect_that_imitates_others_has_the_lesser_prior_weight():
+    """Both always explain alike. Where only creep is ever missing, it has the larger weight; where
+    both are, they have the same, though one was drawn three times as often."""
+    twins = replace(GOOD, effects=(CREEP, replace(CREEP, effect="line_lag")))
+    creep, lag = (
+        sample("first", [case(n, truth=(name,), evidence=twins) for n in range(number)])
+        for name, number in (("creep", 30), ("line_lag", 10))
+    )
+
+    def priors(some):
+        weights = fit_one("first", some, 1.0).weights
+        found = dict(zip([f.name for f in FEATURES["first"]], weights, strict=True))
+        return [found[f"prior_{name}"] for name in ("creep", "line_lag", "drift")]
+
+    often, seldom, never = priors(creep)
+    assert often > 0.5 > -0.5 > seldom
+    assert never == pytest.approx(0.0, abs=1e-9)
+    assert priors(creep + lag) == pytest.approx([0.0, 0.0, 0.0], abs=1e-6)
+
+
+def test_the_effects_with_a_prior_weight_are_those_that_are_missing_in_stored_cases():
+    known = [one for one in all_of(stored()) if one.label == "known"]
+    assert {name for one in known for name in one.truth} == set(PRIOR_EFFECTS)
 
 
 def test_a_calibration_gives_back_how_often_effects_are_missing():

@@ -13,7 +13,7 @@ from surgisoft.diagnosis.criteria import CLAIM, Worth
 from surgisoft.diagnosis.decision import (
     ASSET,
     FEATURES,
-    FORM_SHARE,
+    PRIOR_EFFECTS,
     SCHEMA,
     Curve,
     DecisionModel,
@@ -85,6 +85,7 @@ def given_odds(missing=9.0, known=9.0, two=-9.0, network=-9.0, first=()):
 CLEAR = (("left", -9.0),)
 """The effect that leaves least is the one."""
 PAIR = replace(ALONE, effects=("creep", "payload"))
+PAIR_WITH_LAG = replace(ALONE, effects=("creep", "line_lag"))
 QUIET = replace(GOOD, error_over_floor=1.1, error_over_validated=0.9, error_over_box=1.1)
 STATIC = replace(QUIET, error_over_floor=2.0, error_over_box=1.6, free_static=0.85)
 
@@ -348,18 +349,91 @@ def test_where_an_effect_explains_them_there_is_no_break_and_no_line(free, broke
     assert row["line"] == pytest.approx(line)
 
 
-@pytest.mark.parametrize(("gain", "log_gain"), [(0.0, 0.5), (0.04, 0.25), (1.0, 9.0)])
-def test_a_lack_of_fit_counts_by_how_often_it_is_what_a_formula_gets_wrong(gain, log_gain):
-    """The largest of the proposals, log(1 + lack / 0.02) / 3; its significance counts besides."""
-    names = [feature.name for feature in FEATURES["known"]]
-    lacking = replace(ALONE, form_gain=gain, form_log_gain=log_gain, form_z=1.5)
-    evidence = replace(GOOD, proposals=(lacking, replace(PAIR, form_gain=0.01, form_log_gain=0.0)))
-    row = dict(zip(names, features_of("known", evidence), strict=True))
-    lack = math.sqrt(gain * min(log_gain, 1.0))
-    assert row["lack_of_fit"] == pytest.approx(math.log(1.0 + lack / FORM_SHARE) / 3.0)
-    assert row["form_z"] == pytest.approx(0.5)
+def test_a_proposal_whose_relaxed_form_explains_more_is_less_probably_known():
+    """The largest quantile of the proposals counts, 1.5 of 3 here."""
+    place = [feature.name for feature in FEATURES["known"]].index("form_z")
+    lacking = replace(ALONE, form_z=1.5)
+    row = features_of("known", replace(GOOD, proposals=(lacking, replace(PAIR, form_z=0.5))))
+    assert row[place] == pytest.approx(0.5)
     chances = [probabilities(replace(GOOD, proposals=(each,))).known for each in (ALONE, lacking)]
     assert chances[1] < chances[0]
+
+
+def test_an_effect_that_helps_in_few_blocks_only_is_uneven():
+    """It leaves a fifth of the squared error. Of every block it leaves a fifth as well; or only two
+    of ten blocks, which hold nearly all of the error, fall at all, to a fifth: exp(-0.2 ln 5)."""
+    place = [feature.name for feature in FEATURES["known"]].index("uneven")
+    chances = []
+    for blocks, uneven in ((1.0, 0.0), (0.2, 5.0**-0.2 - 0.2)):
+        best = replace(CREEP, gain=0.8, log_gain=blocks * math.log(5.0))
+        evidence = replace(GOOD, effects=(best, LAG))
+        assert features_of("known", evidence)[place] == pytest.approx(uneven)
+        chances.append(probabilities(evidence).known)
+    assert chances[1] < chances[0]
+
+
+def test_what_only_memory_explains_is_less_probably_missing():
+    """A static function explains 0.1 or 0.8 of the error; with memory 0.9."""
+    place = [feature.name for feature in FEATURES["missing"]].index("static")
+    loud = []
+    for share in (0.1, 0.8):
+        evidence = replace(QUIET, free_static=share, free_box=0.9, proposals=())
+        assert features_of("missing", evidence)[place] == pytest.approx(share / 0.9)
+        loud.append(features_of("missing", evidence)[place])
+    assert loud[0] < loud[1]
+    tiny = replace(QUIET, free_static=0.01, free_box=0.0)
+    assert features_of("missing", tiny)[place] == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(("third", "distinct"), [(0.4, 0.4), (3.0, 1.0), (None, 0.0)])
+def test_an_effect_is_distinct_as_far_as_the_third_one_leaves_more(third, distinct):
+    """The second one may be a relative of it that does the same."""
+    place = [feature.name for feature in FEATURES["missing"]].index("distinct")
+    others = (LAG,) if third is None else (LAG, replace(LAG, effect="drift", left=third))
+    row = features_of("missing", replace(GOOD, effects=(CREEP, *others)))
+    assert row[place] == pytest.approx(distinct)
+
+
+def test_an_effect_is_unique_by_its_share_of_what_returns():
+    """Of three effects that return 0.06, 0.02 and nothing the first has 0.6, and 0.02 is chance.
+
+    Of two proposed effects the lesser counts.
+    """
+    effects = (
+        replace(CREEP, unique=0.06),
+        replace(LAG, unique=0.02),
+        replace(LAG, effect="drift", unique=-0.01),
+    )
+    evidence = replace(GOOD, effects=effects, proposals=(ALONE, PAIR_WITH_LAG))
+    place = [feature.name for feature in FEATURES["first"]].index("unique")
+    assert features_of("first", evidence)[:, place] == pytest.approx([0.6, 0.2, 0.0])
+    place = [feature.name for feature in FEATURES["two"]].index("unique")
+    assert features_of("two", evidence)[place] == pytest.approx(0.2)
+
+
+def test_only_a_listed_effect_has_a_prior_weight():
+    rows = features_of("first", replace(GOOD, effects=(CREEP, replace(LAG, effect="my_own"))))
+    places = [number for number, f in enumerate(FEATURES["first"]) if f.sign == 0]
+    assert [FEATURES["first"][n].name for n in places] == [f"prior_{n}" for n in PRIOR_EFFECTS]
+    assert rows[0, places].sum() == rows[0, places[PRIOR_EFFECTS.index("creep")]] == 1.0
+    assert not rows[1, places].any()
+
+
+@settings(max_examples=60, deadline=None)
+@given(weights, st.floats(-4.0, 4.0), st.floats(0.0, 2.0), st.floats(0.0, 1.0))
+def test_two_are_never_more_probable_than_that_one_of_them_is_missing(values, constant, left, own):
+    """For any weights: P(both) is at most P(one of them)."""
+    models = {
+        name: Logistic(tuple(f.sign * w for f, w in zip(features, values, strict=False)), constant)
+        for name, features in FEATURES.items()
+    }
+    pair = replace(PAIR_WITH_LAG, own_gain=own, own_z=3.0)
+    drift = replace(LAG, effect="drift", gain=0.8, left=0.1)
+    effects = (CREEP, drift, replace(LAG, left=left))
+    evidence = replace(GOOD, effects=effects, proposals=(ALONE, pair))
+    found = probabilities(evidence, DecisionModel(models, {}))
+    assert found.pair <= found.effects["creep"] + found.effects["line_lag"] + 1e-12
+    assert found.pair <= found.known
 
 
 @pytest.mark.parametrize(

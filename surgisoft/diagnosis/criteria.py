@@ -81,9 +81,9 @@ class Worth:
     what is wrong cancel, since `amend` shows that the other one does nothing."""
     first_of_pair: float = 0.5
     """One effect is named, alone or in a set, and another one is missing too."""
-    wrong_unknown: float = -1.0
-    """An effect of the list, or none, is called unknown: as a needless name, it changes no model,
-    and the next experiment shows it."""
+    wrong_unknown: float = -1.4
+    """An effect of the list, or none, is called unknown: no model is changed for it, but the effect
+    is not found either."""
     wrong_nothing: float = -2.0
     """Something is missing and the result is that nothing is."""
     wrong_network: float = -1.0

@@ -194,6 +194,13 @@ def test_dates_become_seconds(tmp_path):
         imported(tmp_path, path, content)
 
 
+def test_times_are_scaled_whose_unit_has_no_name(tmp_path):
+    values = table()
+    path = written(tmp_path / "a.csv", text(values))
+    recording, _ = imported(tmp_path, path, BASE.replace('column = "t"', 'column = "t"\nscale = 7'))
+    np.testing.assert_allclose(recording.t_s, 7 * (values[:, 0] - values[0, 0]), atol=1e-12)
+
+
 def test_nominal_rate_where_there_are_no_time_stamps(tmp_path):
     values = table(5)
     path = written(tmp_path / "a.csv", text(values))

@@ -35,6 +35,11 @@ MAPS = [
     ('column = "t"', "rate_hz = -5", "time.rate_hz: got integer -5; expected a number > 0"),
     (
         'column = "t"',
+        'column = "t"\nrate_hz = 5\nscale = 2',
+        "time.scale: got 2; expected none beside rate_hz or dates",
+    ),
+    (
+        'column = "t"',
         'column = "t"\nunit = "days"',
         "time.unit: got text 'days'; expected one of s",
     ),

@@ -9,9 +9,10 @@ import tomli_w
 from surgisoft.diagnosis.setup.channels import frozen_points
 from surgisoft.diagnosis.setup.sample import Arrangement
 from surgisoft.errors import InputError
-from surgisoft.measurement.recordings import Recording
+from surgisoft.measurement.recordings import AlarmInfo, Recording
 from surgisoft.measurement.recordings.columns import MM_PER
 from surgisoft.measurement.recordings.quality import without_frozen
+from surgisoft.measurement.units import SECONDS_PER
 
 LEAST_ALIKE = 0.05
 """Least gain of the correlation with the corrected measurement for which a command is corrected
@@ -38,6 +39,8 @@ class Correction:
     """(3, 3) true axes in the recorded frame; determinant -1 where it is mirrored. None: right."""
     origin_mm: np.ndarray | None = None
     """(3,) true origin in the recorded frame, mm. None: right."""
+    time_factor: float = 1.0
+    """Seconds in what the recording calls one."""
     delay_s: float = 0.0
     """Delay of the actuation's log, s: what it records at t was true at t - delay_s."""
     from_command: tuple[int, ...] = ()
@@ -78,6 +81,8 @@ class Correction:
             unit=self.unit,
             source=None,
         )
+        if self.time_factor != 1.0:
+            fresh = _in_time(fresh, self.time_factor)
         return self._on_time(fresh) if self.delay_s else fresh
 
     def _commanded(self, commanded: np.ndarray, corrected: np.ndarray) -> np.ndarray:
@@ -124,6 +129,10 @@ class Correction:
         commanded: whether the recording has a command.
         """
         given = self.arrangement
+        time: dict[str, Any] = {}
+        if self.time_factor != 1.0:
+            unit = next((u for u, s in SECONDS_PER.items() if s == self.time_factor), None)
+            time = {"column": "t_s"} | ({"unit": unit} if unit else {"scale": self.time_factor})
         measured: dict[str, Any] = {}
         if given.order != tuple(range(len(given.order))) or self.from_command:
             measured["columns"] = [
@@ -155,6 +164,7 @@ class Correction:
                 frame["mirror"] = True
         command = {"delay_s": measured["delay_s"]} if self.delay_s and commanded else {}
         tables = {
+            "time": time,
             "measured": measured,
             "commanded": command,
             "key_points": key_points,
@@ -186,6 +196,14 @@ def _rotation(rotation: np.ndarray) -> str | list[list[float]]:
         rows = [(int(np.abs(row).argmax()), row.sum() < 0) for row in whole]
         return " ".join(("-" if minus else "") + "xyz"[axis] for axis, minus in rows)
     return [[round(float(v), ROUNDED) for v in row] for row in rotation]
+
+
+def _in_time(recording: Recording, factor: float) -> Recording:
+    """The recording with times so many times as long."""
+    alarm = recording.alarm
+    if alarm is not None:
+        alarm = AlarmInfo(alarm.raised_s * factor, alarm.since_s * factor)
+    return replace(recording, t_s=recording.t_s * factor, alarm=alarm)
 
 
 def _rows(recording: Recording, keep: np.ndarray) -> Recording:

@@ -33,6 +33,7 @@ from surgisoft.diagnosis.setup.sample import (
     between,
     neighbours,
 )
+from surgisoft.measurement.recordings.clock import follows_motion, impossible, time_factors
 from surgisoft.surrogate.effects.misalignment import Misalignment
 from surgisoft.surrogate.model import ArmModel
 
@@ -264,8 +265,19 @@ class Search:
         self.border = Border.of(coarse.model)
         self.chambers = coarse.history.chambers
         self._measured = fine.measured()[0]
+        self.time_factor = 1.0
+        """Seconds in what the recordings call one."""
         self._predicted: dict[Arrangement, np.ndarray] = {}
         self._whole: dict[Arrangement, RowPredictions] = {}
+
+    def in_time(self, factor: float) -> "Search":
+        """The same search with times so many times as long, in the same blocks of rows."""
+        coarse, fine, full = (
+            each.with_time(factor) for each in (self.coarse, self.fine, self.full)
+        )
+        other = Search(coarse, fine, full, self.levels, self.units, self.settings, self.proof)
+        other.time_factor = self.time_factor * factor
+        return other
 
     @cached_property
     def raw(self) -> Fitted:
@@ -317,6 +329,50 @@ class Search:
         if not self._proved(start, best):
             return None
         return Found(best, self._equals(best, tried))
+
+    # Unit of time -----------------------------------------------------------------------------
+
+    def likelier_clock(self) -> tuple["Search", Found | None]:
+        """This search or the same with another unit of time, and the other faults found with it.
+
+        Rows that are impossibly far apart, or near, for a moving arm are taken to be in another
+        unit wherever the model does not contradict. Else the model has to prove the unit, by an
+        error that nothing leaves beside the factor: a factor further in the same direction, which
+        takes away the memories or lets them settle, must be clearly worse, because a memory that
+        the arm has lost is physics.
+        """
+        step = self.row_s
+        factors = time_factors(step) if self.fine.timed and step > 0.0 else []
+        if factors and impossible(step) and self._follows_motion:
+            for factor in factors:
+                other = self.in_time(factor)
+                found = other.run()
+                after = found.best if found else other.start
+                as_read = self.fit(replace(after.hypothesis, later_s=0.0))
+                worst = self.proof.as_good * max(as_read.rmse_mm, self.levels.noise)
+                if after.rmse_mm <= worst:
+                    return other, found
+        found = self.run()
+        before = found.best if found else self.start
+        if before.rmse_mm <= self.limit_mm:
+            return self, found
+        for factor in factors:
+            other = self.in_time(factor)
+            tried = [other.start, other.fit(replace(before.hypothesis, later_s=0.0))]
+            after = other._simplest(tried)
+            if not other._proved(before, after):
+                continue
+            further = self.in_time(factor**2).fit(after.hypothesis)
+            if self.proof.as_good * after.rmse_mm <= further.rmse_mm:
+                return other, Found(after, ()) if after.hypothesis.kinds else None
+        return self, found
+
+    @cached_property
+    def _follows_motion(self) -> bool:
+        """Whether the rows follow the motion of the actuation."""
+        history = self.full.history
+        runs = [history.pressure[k][history.valid[k]].numpy() for k in range(history.runs)]
+        return follows_motion(runs)
 
     # Coarse search ----------------------------------------------------------------------------
 
@@ -565,7 +621,7 @@ class Search:
         asked = self.proof
         # In a wrong unit of length the error before is in that unit, too: no error falls because
         # positions are divided by ten.
-        start = before.rmse_mm * after.hypothesis.mm_per_unit
+        start = before.rmse_mm * after.hypothesis.mm_per_unit / before.hypothesis.mm_per_unit
         enough = self._share(start, after.rmse_mm) >= asked.explained or (
             after.rmse_mm <= min(asked.noticed * self.levels.reference, start / asked.halved)
         )

@@ -18,6 +18,8 @@ LEAST_SHIFT_SD, LEAST_SHIFT_MM = 3.0, 0.5
 mm."""
 UNIT_NAMES = {10.0: "cm", 1000.0: "m", 25.4: "inches"}
 """Names of units of length by their millimetres."""
+TIME_NAMES = {1e-3: "ms", 1e-6: "us"}
+"""Names of units of time by their seconds."""
 
 
 @dataclass(frozen=True)
@@ -25,8 +27,8 @@ class SetupFault:
     """One thing that is wrong with the set-up of a recording."""
 
     kind: str
-    """`chambers`, `actuation_unit`, `key_points`, `length_unit`, `frame`, `time`, `dead_chamber`
-    or `dead_key_point`."""
+    """`time_unit`, `chambers`, `actuation_unit`, `key_points`, `length_unit`, `frame`, `time`,
+    `dead_chamber` or `dead_key_point`."""
     sentence: str
     """What is wrong, in words."""
     numbers: dict[str, float | list] = field(default_factory=dict)
@@ -62,6 +64,19 @@ def faults_of(given: Fitted, frame: Frame, unit: str, recorded_unit: str) -> lis
     }
     kinds: tuple[Kind, ...] = given.hypothesis.kinds
     return [words[kind]() for kind in kinds]
+
+
+def time_unit_fault(factor: float, true_s: float) -> SetupFault:
+    """The fault that times are in another unit.
+
+    factor: seconds in what the recording calls one; true_s: true time between rows [s].
+    """
+    unit = TIME_NAMES[min(factor, 1.0 / factor)]
+    what = f"{1 / factor:,.0f} times too large: {unit} were read as s"
+    if factor > 1.0:
+        what = f"{factor:,.0f} times too small: s were read as {unit}"
+    rows = f"one row each {true_s:.3g} s, where {true_s / factor:.3g} s is stated"
+    return SetupFault("time_unit", f"the times are {what} ({rows})", {"s_per_recorded_s": factor})
 
 
 def joined(faults: Sequence[SetupFault]) -> str:

@@ -276,7 +276,7 @@ def main_times(main: RawTable, spec: ImportMap, count: int | None) -> np.ndarray
     if spec.time.column is not None and spec.time.rate_hz is not None:
         return times(main, spec.time.column, "s") / spec.time.rate_hz
     if spec.time.column is not None:
-        return times(main, spec.time.column, spec.time.unit)
+        return times(main, spec.time.column, spec.time.unit) * spec.time.scale
     if count is None:
         count = len(main.numbers([1]))
     assert spec.time.rate_hz is not None, "a [time] table without a column has a rate"

@@ -440,5 +440,6 @@ def _finished(part: Imported, spec: ImportMap) -> Imported:
     if spec.key_points.spikes == "missing":
         recording, marked = without_spikes(recording)
         notes = [*notes, *marked]
-    notes = [*notes, *plausibility_notes(recording, spec.key_points.unit)]
+    time_unit = spec.time.unit if spec.time.rate_hz is None and spec.time.scale == 1.0 else None
+    notes = [*notes, *plausibility_notes(recording, spec.key_points.unit, time_unit)]
     return Imported(recording, [*notes, *timing_notes(recording, spec.measured.delay_s)])

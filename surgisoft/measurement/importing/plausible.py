@@ -5,7 +5,15 @@ import itertools
 import numpy as np
 
 from surgisoft.measurement.recordings import Recording
+from surgisoft.measurement.recordings.clock import (
+    USUAL_S,
+    follows_motion,
+    likeliest,
+    usual,
+    usual_step_s,
+)
 from surgisoft.measurement.recordings.columns import MM_PER
+from surgisoft.measurement.units import SECONDS_PER
 
 LARGEST_RATIO = 2.0
 """Key points that span more than this multiple of the arm's length are in a wrong unit."""
@@ -18,9 +26,34 @@ BASE_MOTION = 3.0
 """Key points are taken for reversed where the first moves so many times more than the last."""
 
 
-def plausibility_notes(recording: Recording, unit: str | None) -> list[str]:
-    """Contradictions to the arm's stated length or the order base to tip; unit: of positions."""
-    return [*_length(recording, unit), *_order(recording)]
+def plausibility_notes(
+    recording: Recording, unit: str | None, time_unit: str | None = None
+) -> list[str]:
+    """Contradictions to the arm's stated length, the order base to tip and a moving arm's rows.
+
+    unit: of positions; time_unit: of the column of times, None where the map states a rate.
+    """
+    return [*_length(recording, unit), *_order(recording), *_step(recording, time_unit)]
+
+
+def _step(recording: Recording, time_unit: str | None) -> list[str]:
+    """A note where rows are too far apart, or too near, to follow a moving arm."""
+    step = usual_step_s([recording])
+    if step is None or usual(step):
+        return []
+    if not follows_motion([recording.measured[run] for run in recording.runs]):
+        return []
+    low, high = USUAL_S
+    text = f"one row each {step:.3g} s, expected {low:g} to {high:g} s of an arm that moves"
+    by = SECONDS_PER.get(time_unit or "")
+    others = {} if by is None else {u: s / by for u, s in SECONDS_PER.items() if u != time_unit}
+    likely = likeliest(step, others.values())
+    named = next((u for u, factor in others.items() if factor == likely), None)
+    advice = "check rate_hz, column and unit in [time]"
+    if named is not None:
+        advice = f'if the times are in {named}, set unit = "{named}" in [time]'
+    slow = ' (steady-state samples: kind = "settled" in [recording])' if step > high else ""
+    return [f"{text}: {advice}{slow}"]
 
 
 def _length(recording: Recording, unit: str | None) -> list[str]:

@@ -90,6 +90,8 @@ class TimeMap:
     """Column of the main file."""
     unit: Annotated[str, TIME_UNIT] = "s"
     """A unit of time, or "iso" for dates such as 2024-05-01T12:00:00.25."""
+    scale: Annotated[float, POSITIVE] = 1.0
+    """Factor of all times of the column, for a clock whose unit has no name here."""
     rate_hz: Annotated[float, POSITIVE] | None = None
     """Nominal rate where there are no time stamps [Hz]; with a column, the column counts frames."""
     zero: Annotated[str, one_of(("file", "recording", "none"))] = "file"
@@ -99,6 +101,10 @@ class TimeMap:
         """The table itself; raises InputError unless it has a column or a rate."""
         if self.column is None and self.rate_hz is None:
             raise where.error("neither column nor rate_hz", "a column, a rate, or both")
+        if self.scale != 1.0 and (self.rate_hz is not None or self.unit == "iso"):
+            raise (where / "scale").error(
+                f"got {self.scale:g}", "none beside rate_hz or dates, which state seconds already"
+            )
         return self
 
 

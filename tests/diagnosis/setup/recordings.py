@@ -76,3 +76,8 @@ def late(recording: Recording, rows: int) -> Recording:
         key_points_mm=recording.key_points_mm[body],
         temp_C=None,
     )
+
+
+def in_time(recording: Recording, factor: float) -> Recording:
+    """The recording with times so many times as long."""
+    return replace(recording, t_s=recording.t_s * factor)

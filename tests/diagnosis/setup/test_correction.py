@@ -12,7 +12,7 @@ from surgisoft.diagnosis.setup import find_setup_faults
 from surgisoft.measurement.importing import import_files, load_map
 from surgisoft.measurement.recordings import load_recording, save_recording
 from surgisoft.surrogate.checkpoint import default_arm
-from tests.diagnosis.setup.recordings import driven, late, measured, turned, with_points
+from tests.diagnosis.setup.recordings import driven, in_time, late, measured, turned, with_points
 
 WRONG = {
     "frame and cm": lambda r: with_points(
@@ -24,6 +24,8 @@ WRONG = {
     ),
     "psi and sign": lambda r: driven(r, lambda u: u * [1.0, -1.0, 1.0] / 6.894757293168361),
     "reversed and too large": lambda r: with_points(r, r.key_points_mm[:, ::-1] * 1000),
+    "ms and late": lambda r: in_time(late(r, 5), 1e3),
+    "s read as ms": lambda r: in_time(r, 1e-3),
     "late": lambda r: late(r, 5),
     "early": lambda r: late(r, -8),
 }
@@ -66,6 +68,7 @@ def test_the_lines_of_the_map_mend_like_apply(name, tmp_path):
     )[0]
     corrected = found.corrected([wrong])[0]
     np.testing.assert_allclose(part.recording.measured, corrected.measured, atol=5e-3)
+    np.testing.assert_allclose(np.diff(part.recording.t_s), np.diff(corrected.t_s), atol=1e-9)
     np.testing.assert_allclose(part.recording.key_points_mm, corrected.key_points_mm, atol=2e-2)
     assert find_setup_faults(default_arm(), [part.recording]) is None
 

@@ -12,6 +12,7 @@ from surgisoft.diagnosis.setup import find_setup_faults
 from surgisoft.surrogate.checkpoint import default_arm
 from tests.diagnosis.setup.recordings import (
     driven,
+    in_time,
     late,
     measured,
     predicted,
@@ -28,6 +29,10 @@ def points(change):
 
 def actuation(change):
     return lambda r: driven(r, change)
+
+
+def times(factor):
+    return lambda r: in_time(r, factor)
 
 
 SINGLE = {
@@ -74,6 +79,9 @@ SINGLE = {
         "the sign of chamber 3 is flipped",
     ),
     "reversed": (points(lambda x: x[:, ::-1]), "key_points", "in reverse order, tip to base"),
+    "ms": (times(1e3), "time_unit", "1,000 times too large: ms were read as s"),
+    "s read as ms": (times(1e-3), "time_unit", "1,000 times too small: s were read as ms"),
+    "us": (times(1e6), "time_unit", "1,000,000 times too large: us were read as s"),
     "late": (lambda r: late(r, 6), "time", "s late relative to the actuation"),
     "early": (lambda r: late(r, -4), "time", "s early relative to the actuation"),
 }
@@ -125,6 +133,9 @@ PAIRS = [
     ("psi", "late"),
     ("turned and shifted", "late"),
     ("permuted", "psi"),
+    ("ms", "turned and shifted"),
+    ("ms", "psi"),
+    ("s read as ms", "reversed"),
 ]
 
 
@@ -151,6 +162,7 @@ PHYSICS = {
     "a gain of 7 %": actuation(lambda u: u * [1.07, 1.0, 1.0]),
     "a lag of 0.25 s": lambda r: lagged(r, 0.25),
     "a lag of 0.6 s": lambda r: lagged(r, 0.6),
+    "a lag of 30 s": lambda r: lagged(r, 30.0),
     "a load that bends the arm aside": points(
         lambda x: x + np.array([4.0, 0.0, 0.0]) * np.linspace(0, 1, 5)[:, None] ** 2
     ),

@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from surgisoft.diagnosis.residuals import Problem
 from surgisoft.measurement.recordings import AlarmInfo, Recording, after_alarm
+from surgisoft.measurement.recordings.clock import gaps_in_words
 
 FAR_FROM_FIT = 2.0
 """An actuation is far from the fit where its distance from the nearest actuation of the fit exceeds
@@ -83,6 +84,15 @@ def _alarm_hint(recording: Recording, alarm: AlarmInfo, seen: bool) -> str:
     return (
         f"{recording.name}: an alarm was raised at {alarm.raised_s:.1f} s of the run: the model "
         f"has not been valid since {alarm.since_s:.1f} s; {looked}; {advice}"
+    )
+
+
+def gap_hints(recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """A sentence for each recording with gaps inside runs, and what to do about them."""
+    return tuple(
+        f"{recording.name}: {found}"
+        for recording in recordings
+        if (found := gaps_in_words(recording))
     )
 
 

@@ -24,7 +24,12 @@ from pathlib import Path
 
 from surgisoft.diagnosis.candidates import candidates
 from surgisoft.diagnosis.criteria import SEARCH
-from surgisoft.diagnosis.data_quality import alarm_hints, data_quality_warnings, thinning_notes
+from surgisoft.diagnosis.data_quality import (
+    alarm_hints,
+    data_quality_warnings,
+    gap_hints,
+    thinning_notes,
+)
 from surgisoft.diagnosis.decision import (
     CLEAR_JUMPS,
     CLEAR_SHIFT,
@@ -356,7 +361,7 @@ def diagnose(
     if result.next_command.startswith("surgisoft amend"):
         unknown = not held_out_in_fit(model, whole, table.held_out)
         result = replace(result, next_command=amend_command(result, unknown))
-    checks = (*alarm_hints(whole, recordings), *result.checks)
+    checks = (*alarm_hints(whole, recordings), *gap_hints(whole), *result.checks)
     return replace(result, checks=checks, notes=notes, seconds=time.perf_counter() - begin)
 
 

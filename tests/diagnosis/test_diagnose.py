@@ -44,6 +44,19 @@ def test_nothing_is_named_on_a_clean_robot(found):
     assert verdict.effects == ()
 
 
+def test_a_gap_inside_a_run_is_a_check(found):
+    whole = recorded()
+    kept = np.delete(np.arange(whole.samples), np.s_[800:900])
+    values = {
+        name: getattr(whole, name)[kept] for name in ("t_s", "measured", "key_points_mm", "run")
+    }
+    values["commanded"] = whole.commanded[kept] if whole.commanded is not None else None
+    with_gap = replace(whole, temp_C=None, payload_g=None, **values)
+    (check,) = [each for each in diagnose(default_arm(), [with_gap]).checks if "gap" in each]
+    assert check.startswith(f"{whole.name}: a gap without rows inside a run (")
+    assert not any("gap" in each for each in found[""].checks)
+
+
 @pytest.mark.parametrize("name", ["creep", "misalignment", "hysteresis"])
 def test_the_hidden_effect_is_named(found, name):
     """Alone or in a set of two, whichever the fitted decision finds worth more."""

@@ -80,6 +80,29 @@ def test_dry_run_shows_and_writes_nothing(lab, capsys):
     assert sorted(lab.iterdir()) == before
 
 
+def test_the_clock_of_a_moving_arm_is_looked_at(lab, capsys):
+    """Times in ms that the map reads as s, and 40 s without rows."""
+    t = np.delete(np.arange(3000), np.s_[1000:1800])
+    u, x = 10 + 10 * np.sin(0.1 * t), 0.01 * np.sin(0.1 * t)
+    rows = "\n".join(f"{50 * k},{a:.4f},{b:.5f},0,0.05" for k, a, b in zip(t, u, x, strict=True))
+    (lab / "ms.csv").write_text(f"t,u,x,y,z\n{rows}\n")
+    timed = MAP.replace("rate_hz = 20", 'column = "t"')
+    (lab / "s.toml").write_text(timed)
+    (lab / "ms.toml").write_text(timed.replace('"t"', '"t"\nunit = "ms"'))
+    (lab / "runs.toml").write_text((lab / "ms.toml").read_text() + "[runs]\ngap_s = 60\n")
+    notes = {}
+    for name in ("s", "ms", "runs"):
+        out = ("-o", lab / "rec.csv", "--dry-run")
+        assert surgisoft("import", lab / "ms.csv", "--map", lab / f"{name}.toml", *out) == 0
+        notes[name] = [x for x in capsys.readouterr().out.splitlines() if x.startswith("note: ")]
+    assert "one row each 50 s, expected 0.0005 to 2 s" in notes["s"][0]
+    assert 'if the times are in ms, set unit = "ms" in [time]' in notes["s"][0]
+    assert len(notes["ms"]) == 1
+    assert "a gap without rows inside a run (40.05 s from 49.95 s on)" in notes["ms"][0]
+    assert "set gap_s = 1 in [runs] of the map" in notes["ms"][0]
+    assert notes["runs"] == []
+
+
 def test_existing_recordings_are_kept_all_of_them(lab, capsys):
     raw = [lab / "one.csv", lab / "two.csv"]
     out = lab / "out"

@@ -46,6 +46,7 @@ from surgisoft.measurement.importing.spec import (
 )
 from surgisoft.measurement.importing.timing import timing_notes
 from surgisoft.measurement.recordings import Recording
+from surgisoft.measurement.recordings.clock import gaps_in_words
 from surgisoft.measurement.recordings.lerobot import is_dataset, load_lerobot
 from surgisoft.measurement.recordings.log import SUFFIX as LOG_SUFFIX
 from surgisoft.measurement.recordings.log import read_log
@@ -442,4 +443,6 @@ def _finished(part: Imported, spec: ImportMap) -> Imported:
         notes = [*notes, *marked]
     time_unit = spec.time.unit if spec.time.rate_hz is None and spec.time.scale == 1.0 else None
     notes = [*notes, *plausibility_notes(recording, spec.key_points.unit, time_unit)]
+    if spec.runs.gap_s is None and (found := gaps_in_words(recording)):
+        notes = [*notes, found]
     return Imported(recording, [*notes, *timing_notes(recording, spec.measured.delay_s)])

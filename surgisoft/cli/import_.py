@@ -135,11 +135,23 @@ def _draft(raw: list[Path], place: Path, force: bool) -> None:
 
 def _test_setup(arm: "ArmModel", name: str, recordings: list) -> None:
     """Print what a model shows to be wrong with the set-up of recordings; name: of the model."""
-    from surgisoft.diagnosis.setup import find_setup_faults
+    from surgisoft.diagnosis.setup import find_setup_faults, fit_of_model
 
     found = find_setup_faults(arm, recordings)
     if found is None:
-        print(f"set-up: no fault that {name} shows")
+        fit = fit_of_model(arm, recordings)
+        if fit is None:
+            print(f"set-up: no fault that {name} shows")
+            return
+        error = f"error {fit.rmse_mm:.3g} mm, expected about {fit.expected_mm:.3g} mm"
+        if fit.fits:
+            print(f"set-up: no fault that {name} shows ({error})")
+            return
+        warn(
+            f"set-up: {name} does not describe this arm's motion of {fit.motion_mm:.3g} mm "
+            f"({error}), and no fault that is tested explains it: check that MODEL is of this arm, "
+            "and in the map the columns of [measured] and [key_points], their units and [frame]"
+        )
         return
     warn(f"set-up: {found.sentence}")
     print(f"to correct it, {IN_A_MAP}:")

@@ -13,6 +13,7 @@ _NEWTONS_PER = {"N": 1.0, "mN": 1e-3, "kN": 1e3}
 ACTUATION_UNITS = (*KPA_PER, *_DEGREES_PER, *_VOLTS_PER, *_NEWTONS_PER)
 """Units of pressures, angles, voltages and forces."""
 _QUANTITIES = (KPA_PER, _DEGREES_PER, MM_PER, _VOLTS_PER, _NEWTONS_PER)
+_ALL = (*_QUANTITIES, SECONDS_PER)
 
 
 def factor(unit: str, to: str) -> float | None:
@@ -23,6 +24,31 @@ def factor(unit: str, to: str) -> float | None:
         if unit in quantity and to in quantity:
             return quantity[unit] / quantity[to]
     return None
+
+
+def unit_named(text: str) -> str | None:
+    """The known unit that a text is; None for another one.
+
+    Upper and lower case count only where they tell two units apart, such as MPa and mPa.
+    """
+    known = [unit for quantity in _ALL for unit in quantity]
+    if text.strip() in known:
+        return text.strip()
+    like = [unit for unit in known if unit.lower() == text.strip().lower()]
+    return like[0] if len(like) == 1 else None
+
+
+def same_unit(first: str, second: str) -> bool | None:
+    """Whether two units are the same; None where they measure different quantities.
+
+    True also where a quantity is not known, because then nothing contradicts.
+    """
+    if first == second:
+        return True
+    of = [next((q for q in _ALL if unit in q), None) for unit in (first, second)]
+    if of[0] is None or of[1] is None:
+        return True
+    return False if of[0] is of[1] else None
 
 
 def check_conversion(unit: str, to: str, where: Where) -> None:

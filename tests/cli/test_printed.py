@@ -13,6 +13,7 @@ from surgisoft.cli import run
 from surgisoft.cli.diagnose import announced
 from surgisoft.cli.fit import above_noise
 from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Ranked, Verdict
+from surgisoft.diagnosis.setup import ModelFit
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import Recording, save_recording
 from surgisoft.surrogate.checkpoint import load_model, save_model
@@ -602,14 +603,24 @@ def test_an_import_names_what_looks_wrong(bench, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("surgisoft.measurement.recordings.find_warnings", lambda rec: [wrong])
     faults = "surgisoft.diagnosis.setup.find_setup_faults"
     monkeypatch.setattr(faults, lambda *_: None)
+    fit = "surgisoft.diagnosis.setup.fit_of_model"
+    monkeypatch.setattr(fit, lambda *_: ModelFit(0.4, 0.42, 10.0))
     new = str(tmp_path / "new.parquet")
     command = ["import", "raw.csv", "--map", "m.toml", "-o", new, "--dry-run"]
     assert run([*command, "--model", "default"]) == 0
     shown = capsys.readouterr()
     assert "note: the clock was set\n" in shown.out
     assert f"would write {new}: " in shown.out
-    assert shown.out.endswith("set-up: no fault that default shows\n")
+    assert shown.out.endswith(
+        "set-up: no fault that default shows (error 0.4 mm, expected about 0.42 mm)\n"
+    )
     assert f"{new}, row 5: a jump of 30 mm" in shown.err
+    monkeypatch.setattr(fit, lambda *_: ModelFit(54.0, 0.42, 10.0))
+    assert run([*command, "--model", "default"]) == 0
+    shown = capsys.readouterr()
+    assert "no fault that default shows" not in shown.out
+    assert "default does not describe this arm's motion of 10 mm (error 54 mm, " in shown.err
+    assert "no fault that is tested explains it: check that MODEL is of this arm" in shown.err
     monkeypatch.setattr(
         faults, lambda *_: found_setup(sentence="turned by 90 degrees", recordings=("bench",))
     )

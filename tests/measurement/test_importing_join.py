@@ -240,7 +240,8 @@ def test_frozen_rows_are_left_out_when_asked(tmp_path):
     assert one(tmp_path, path).recording.samples == 600
     part = one(tmp_path, path, '[rows]\nfrozen = "drop"')
     np.testing.assert_array_equal(part.recording.t_s, np.delete(t, slice(201, 320)))
-    assert "p1 frozen at 10.000 s of run 0: 119 rows left out" in part.notes[-1]
+    assert "p1 frozen at 10.000 s of run 0: 119 rows left out" in part.notes[0]
+    assert "a gap without rows inside a run (6 s from 10 s on)" in part.notes[1]
 
 
 def test_spikes_are_missing_when_asked(tmp_path):
@@ -249,7 +250,7 @@ def test_spikes_are_missing_when_asked(tmp_path):
     x = 10 * np.sin(0.3 * t) + rng.normal(0, 0.02, 600)
     x[300:303] += 9
     path = log(tmp_path, t, u=np.sin(0.3 * t) + rng.normal(0, 0.01, 600), x=x)
-    content = ONE.replace('["x", "y", "w"]', '["y", "y", "w"]').replace("ROWS", "")
+    content = ONE.replace('["x", "y", "w"]', '["w", "y", "z"]').replace("ROWS", "")
     kept = run(tmp_path, [path], content.replace("KEYS", ""))[0]
     assert not np.isnan(kept.recording.key_points_mm).any()
     marked = run(tmp_path, [path], content.replace("KEYS", 'spikes = "missing"'))[0]

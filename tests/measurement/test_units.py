@@ -3,7 +3,7 @@
 import pytest
 
 from surgisoft.measurement.recordings.columns import MM_PER
-from surgisoft.measurement.units import SECONDS_PER, factor
+from surgisoft.measurement.units import SECONDS_PER, factor, same_unit, unit_named
 
 VALUES = [
     ("in", "mm", 25.4),
@@ -44,3 +44,18 @@ def test_lengths_and_times():
         "min": 60.0,
         "h": 3600.0,
     }
+
+
+def test_a_unit_is_known_by_its_letters():
+    assert unit_named(" kpa ") == "kPa"
+    assert unit_named("PSI") == "psi"
+    assert unit_named("mn") == "mN"
+    assert unit_named("count") is None
+
+
+def test_units_of_one_quantity_differ_and_unknown_ones_contradict_nothing():
+    assert same_unit("kPa", "kPa") is True
+    assert same_unit("bar", "kPa") is False
+    assert same_unit("mm", "kPa") is None
+    assert same_unit("ms", "mm") is None
+    assert same_unit("norm", "kPa") is True

@@ -60,6 +60,28 @@ SLOW_OR_WRONG = (
 
 
 @dataclass(frozen=True)
+class ModelFit:
+    """How well a model predicts recordings as they are, on their training rows."""
+
+    rmse_mm: float
+    """RMS error of a key point, mm."""
+    expected_mm: float
+    """What it is with a correct set-up where nothing is missing: the model's validated error and
+    the noise of the recordings together, mm."""
+    motion_mm: float
+    """RMS motion of the key points as recorded, mm."""
+
+    @property
+    def fits(self) -> bool:
+        """Whether the recordings can be of the model's arm: it predicts most of their motion, as it
+        does whatever physics is missing. True of an arm that hardly moves, which shows nothing."""
+        if self.motion_mm <= PROOF.noticed * self.expected_mm:
+            return True
+        most = max(PROOF.left_of_motion * self.motion_mm, PROOF.noticed * self.expected_mm)
+        return self.rmse_mm <= most
+
+
+@dataclass(frozen=True)
 class SetupResult:
     """Faults in the set-up of some recordings."""
 
@@ -151,11 +173,37 @@ def find_setup_faults(model: ArmModel, recordings: Sequence[Recording]) -> Setup
     return together or first
 
 
-def _of_one_setup(model: ArmModel, recordings: list[Recording]) -> SetupResult | None:
-    """The faults of recordings that share them."""
+def fit_of_model(model: ArmModel, recordings: Sequence[Recording]) -> ModelFit | None:
+    """How well a model predicts recordings of its arm; None where no key point is measured.
+
+    Raises InputError for recordings of another number of chambers or key points.
+    """
+    check_fits(model.spec, list(recordings), sized=False)
+    measured = [r for r in recordings if np.isfinite(r.key_points_mm).any()]
+    if not measured:
+        return None
+    sample = sample_of(model, measured, SETTINGS.fine_rows)
+    points = sample.measured()[0]
+    plain = Arrangement.as_recorded(sample.history.chambers)
+    apart = np.square(points - sample.predicted([plain])[0]).sum(2)
+    motion = np.square(points - np.nanmean(points, axis=0)).sum(2)
+    return ModelFit(
+        rmse_mm=float(np.sqrt(np.nanmean(apart))),
+        expected_mm=_levels(model, measured).reference,
+        motion_mm=float(np.sqrt(np.nanmean(motion))),
+    )
+
+
+def _levels(model: ArmModel, recordings: list[Recording]) -> Levels:
+    """The levels that errors of a model on recordings are compared with."""
     noise, _ = noise_of(recordings)
     discrepancy = model_discrepancy(model, noise)
-    levels = Levels(float(np.sqrt(np.mean(noise**2))), float(np.sqrt(np.mean(discrepancy**2))))
+    return Levels(float(np.sqrt(np.mean(noise**2))), float(np.sqrt(np.mean(discrepancy**2))))
+
+
+def _of_one_setup(model: ArmModel, recordings: list[Recording]) -> SetupResult | None:
+    """The faults of recordings that share them."""
+    levels = _levels(model, recordings)
     dead, masked, commanded = dead_channels(model.spec, recordings)
     search, found = _search(model, masked, levels).likelier_clock()
     taken: tuple[int, ...] = ()

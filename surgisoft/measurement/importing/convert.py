@@ -16,6 +16,7 @@ import numpy as np
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.importing.align import Joined, join
+from surgisoft.measurement.importing.names import check_columns, uses
 from surgisoft.measurement.importing.plausible import plausibility_notes
 from surgisoft.measurement.importing.points import (
     key_points_of,
@@ -206,6 +207,7 @@ def _import_set(files: dict[str, Path], spec: ImportMap) -> Imported:
     commanded = _with_columns(spec.commanded, tables, "c") if spec.commanded else None
     commanded = commanded if commanded and commanded.columns else None
     _check_actuation(measured, commanded, tables)
+    said = check_columns(uses(spec, measured, commanded), tables)
     points = key_points_of(spec.key_points, tables[spec.key_points.file])
     needed: dict[str, list[Column]] = {name: [] for name in tables}
     needed[measured.file] += measured.columns
@@ -243,7 +245,7 @@ def _import_set(files: dict[str, Path], spec: ImportMap) -> Imported:
     )
     draft, notes = tidy(draft, spec, joined.main.cells.place)
     recording = _recording(draft, spec, measured.to or measured.unit, placed.gravity, joined)
-    return Imported(recording, [*joined.notes, *placed.notes, *notes])
+    return Imported(recording, [*said, *joined.notes, *placed.notes, *notes])
 
 
 def _with_columns(spec: ActuationMap, tables: dict[str, RawTable], letter: str) -> ActuationMap:

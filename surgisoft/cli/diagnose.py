@@ -246,7 +246,8 @@ def _show(found) -> None:
     for check in found.checks:
         print(f"check: {check}")
     rows = "left-out RMSE" if found.in_fit else "held-out RMSE"
-    print(f"{'effect':18s} {'conf.':>6s} {'alone':>7s} {'unique':>7s} {rows:>24s}")
+    if found.shown:
+        print(f"{'effect':18s} {'conf.':>6s} {'alone':>7s} {'unique':>7s} {rows:>24s}")
     for row in found.shown:
         low, high = row.ci95
         print(

@@ -135,7 +135,8 @@ def _draft(raw: list[Path], place: Path, force: bool) -> None:
 
 def _test_setup(arm: "ArmModel", name: str, recordings: list) -> None:
     """Print what a model shows to be wrong with the set-up of recordings; name: of the model."""
-    from surgisoft.diagnosis.setup import find_setup_faults, fit_of_model
+    from surgisoft.diagnosis.residuals import fit_of_model
+    from surgisoft.diagnosis.setup import find_setup_faults
 
     found = find_setup_faults(arm, recordings)
     if found is None:

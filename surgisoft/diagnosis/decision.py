@@ -55,10 +55,11 @@ Kind = Literal[
     "cannot_tell",
     "setup",
 ]
-Reason = Literal["network", "learned", "repeatability", "few_data", "schedule"]
+Reason = Literal["network", "learned", "repeatability", "few_data", "schedule", "before"]
 """Why a diagnosis cannot tell: the model is not that of this arm; the model has learned part of
 what is missing; how well recordings of an unchanged arm agree is not known well enough; there are
-too few motions; the schedule does not tell effects apart."""
+too few motions; the schedule does not tell effects apart; the model does not describe the
+recordings from before a change."""
 
 SCHEMA = 7
 """Version of the asset's format and of the features: weights belong to the features that they were

@@ -22,6 +22,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+from surgisoft.diagnosis.black_box import black_box
 from surgisoft.diagnosis.candidates import candidates
 from surgisoft.diagnosis.criteria import SEARCH
 from surgisoft.diagnosis.data_quality import (
@@ -106,6 +107,7 @@ REASONS = {
     "repeatability": "most probably nothing has changed, but the change is not clearly as small as "
     "the differences between recordings of an unchanged arm: record the same schedule twice before "
     "a change, so that these differences are known",
+    "before": "the model does not describe the recordings from before the change",
     "few_data": "the recordings contain too few different motions",
     "schedule": "several causes explain these recordings about equally well, and none well enough",
 }
@@ -332,7 +334,9 @@ def diagnose(
     both = None
     if before is not None:
         both = before_and_after(table, load_recordings(before), paired)
-        problem, notes = both.training(), (*notes, *both.notes)
+        problem = both.training()
+        # The sentence says it where nothing can be told.
+        notes = notes if both.strange is not None and not both.used else (*notes, *both.notes)
     else:
         problem = with_known_residuals(table.training(), reference)
     notes = (*notes, *thinning_notes(problem))
@@ -383,6 +387,8 @@ def diagnose_change(
     problem: training rows of the recordings after the change, as `BeforeAfter.training` poses them,
     of the given model or of one that was amended since.
     """
+    if both.strange is not None and not both.used:
+        return without_before(both)
     found, not_testable = findings_of(problem, report, without)
     result = replace(result_of(found), not_testable=not_testable)
     result = with_less(since(result, both, found), found)
@@ -429,6 +435,25 @@ def since(result: Diagnosis, both: BeforeAfter, found: Findings) -> Diagnosis:
     if both.used:
         track = both.track(found.problem, found.explained_mm(verdict.effects))
     return replace(result, change=both.change, track=track, verdict=replace(verdict, sentence=text))
+
+
+def without_before(both: BeforeAfter) -> Diagnosis:
+    """The diagnosis of a change where the model does not describe BEFORE: nothing can be told.
+
+    Without pairs the residuals before are what the change is measured from, and residuals of
+    another arm, or of another set-up, say nothing about this one. No effect is looked for.
+    """
+    problem = both.plain.training()
+    best = best_achievable(problem, black_box(problem), None)
+    head = f"since {both.names}: cannot tell what is missing, if anything"
+    return Diagnosis(
+        verdict=Verdict("cannot_tell", (), f"{head}: {both.strange_in_words}", reason="before"),
+        error_mm=ErrorLevels(problem.rmse_mm, problem.floor_mm, best.rmse_mm),
+        ranking=(),
+        next_command="surgisoft diagnose {model} {data}",
+        change=both.change,
+        in_fit=problem.in_fit,
+    )
 
 
 def with_less(result: Diagnosis, found: Findings) -> Diagnosis:

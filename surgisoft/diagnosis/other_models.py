@@ -93,6 +93,18 @@ def refuse_predictions(model: Any) -> None:
         )
 
 
+def _refuse_same(measured: list[Recording], before: list[Recording]) -> None:
+    """Raise InputError where one recording is given both before and after a change."""
+    for recording in measured:
+        for other in before:
+            files = [each.source and each.source.resolve() for each in (recording, other)]
+            if recording is other or (files[0] is not None and files[0] == files[1]):
+                raise InputError(
+                    f"{recording.label}: is given both before and after the change, expected "
+                    "recordings from before it that are others than those after it"
+                )
+
+
 def open_model(
     model: ArmModel | str | Path | Callable,
     recordings: Given,
@@ -105,10 +117,12 @@ def open_model(
     model: an arm model or its folder; a callable, or its name; a file of predictions; with
     `predictions`, any name. predictions: files of predictions, one for each recording, then one for
     each of `before`. error_mm: RMS error of a key point that a callable, or the model behind
-    predictions, was validated with; default: what it states, else its error on `before`.
+    predictions, was validated with; default: what it states, else its error on `before`. Raises
+    InputError where a recording is also one of `before`.
     """
     measured = load_recordings(recordings)
     earlier = None if before is None else load_recordings(before)
+    _refuse_same(measured, earlier or [])
     name = str(model) if isinstance(model, str | Path) else ""
     if predictions is None and is_predictions_file(model):
         predictions, name = [name], Path(name).stem

@@ -22,6 +22,7 @@ place of a correlation, because the level of an actuation counts.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -37,9 +38,11 @@ from surgisoft.diagnosis.residuals import (
     ROWS,
     STILL,
     Floor,
+    ModelFit,
     Problem,
     ResidualTable,
     model_discrepancy,
+    model_fit,
     residual_table,
 )
 from surgisoft.errors import InputError, unknown_name
@@ -987,9 +990,33 @@ class BeforeAfter:
             return replace(self, table=self.plain, used=False)
         return self
 
+    @cached_property
+    def strange(self) -> ModelFit | None:
+        """The model's fit to BEFORE where it does not describe it, though it describes AFTER."""
+        before, after = model_fit(self.earlier), model_fit(self.plain)
+        if before is None or after is None or before.fits or not after.fits:
+            return None
+        return before
+
+    @property
+    def strange_in_words(self) -> str:
+        """That the model does not describe BEFORE, and what to do; empty where that is not so."""
+        if self.strange is None:
+            return ""
+        after = model_fit(self.plain)
+        return (
+            f"the model does not describe {self.names} (error {self.strange.rmse_mm:.3g} mm, "
+            f"motion {self.strange.motion_mm:.3g} mm), though it describes the recordings after "
+            f"the change (error {after.rmse_mm if after else 0.0:.3g} mm): give recordings of this "
+            "arm from before the change, or leave out --before; a diagnosis of "
+            f"{self.names} alone tests the set-up"
+        )
+
     @property
     def notes(self) -> tuple[str, ...]:
         """Limits of the result, in words."""
+        if self.strange is not None:
+            return (self.strange_in_words,)
         if self.used:
             return ()
         share = float(self.pairs.paired[~self.table.held_out].mean())

@@ -625,6 +625,62 @@ def model_discrepancy(model: ArmModel, noise_mm: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(validated**2 - noise**2, (LEAST_DISCREPANCY * validated) ** 2))
 
 
+# Whose arm it is ----------------------------------------------------------------------------------
+
+LEFT_OF_MOTION = 0.35
+"""Most error of a model of this arm, as a share of the motion of the key points: with a correct
+set-up it predicts most of the motion, whatever physics is missing."""
+NOTICED = 1.5
+"""Least error that is noticed, as a multiple of the validated error and the noise together."""
+
+
+@dataclass(frozen=True)
+class ModelFit:
+    """How well a model predicts recordings as they are."""
+
+    rmse_mm: float
+    """RMS error of a key point, mm."""
+    expected_mm: float
+    """What it is with a correct set-up where nothing is missing: the model's validated error and
+    the noise of the recordings together, mm."""
+    motion_mm: float
+    """RMS motion of the key points as recorded, mm."""
+
+    @property
+    def fits(self) -> bool:
+        """Whether the recordings can be of the model's arm: it predicts most of their motion, as it
+        does whatever physics is missing. True of an arm that hardly moves, which shows nothing."""
+        if self.motion_mm <= NOTICED * self.expected_mm:
+            return True
+        most = max(LEFT_OF_MOTION * self.motion_mm, NOTICED * self.expected_mm)
+        return self.rmse_mm <= most
+
+
+def model_fit(table: ResidualTable) -> ModelFit | None:
+    """How well the model predicts the rows of a table; None where no key point is measured."""
+    points = table.measured_mm
+    if np.isnan(points).all():
+        return None
+    seen = np.isfinite(points).all(2)
+    away = np.where(seen[..., None], points, 0.0)
+    mean = away.sum(0) / np.maximum(seen.sum(0), 1)[:, None]
+    motion = np.square(points - mean).sum(2)
+    discrepancy = model_discrepancy(table.model, table.noise_mm)
+    return ModelFit(
+        rmse_mm=float(np.sqrt(np.nanmean(np.square(table.error_mm)))),
+        expected_mm=float(np.sqrt(np.mean(table.noise_mm**2) + np.mean(discrepancy**2))),
+        motion_mm=float(np.sqrt(np.nanmean(motion))),
+    )
+
+
+def fit_of_model(model: ArmModel, recordings: Sequence[Recording]) -> ModelFit | None:
+    """How well a model predicts recordings as they are; None where no key point is measured.
+
+    Raises InputError for recordings of another number of chambers or key points.
+    """
+    return model_fit(residual_table(model, list(recordings)))
+
+
 def blocks(
     history: History, seen: np.ndarray, step: int = 1, least_blocks: int = LEAST_BLOCKS
 ) -> np.ndarray:

@@ -13,7 +13,7 @@ from surgisoft.cli import run
 from surgisoft.cli.diagnose import announced
 from surgisoft.cli.fit import above_noise
 from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Ranked, Verdict
-from surgisoft.diagnosis.setup import ModelFit
+from surgisoft.diagnosis.residuals import ModelFit
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import Recording, save_recording
 from surgisoft.surrogate.checkpoint import load_model, save_model
@@ -603,7 +603,7 @@ def test_an_import_names_what_looks_wrong(bench, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("surgisoft.measurement.recordings.find_warnings", lambda rec: [wrong])
     faults = "surgisoft.diagnosis.setup.find_setup_faults"
     monkeypatch.setattr(faults, lambda *_: None)
-    fit = "surgisoft.diagnosis.setup.fit_of_model"
+    fit = "surgisoft.diagnosis.residuals.fit_of_model"
     monkeypatch.setattr(fit, lambda *_: ModelFit(0.4, 0.42, 10.0))
     new = str(tmp_path / "new.parquet")
     command = ["import", "raw.csv", "--map", "m.toml", "-o", new, "--dry-run"]

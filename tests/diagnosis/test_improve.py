@@ -116,7 +116,7 @@ def test_with_recordings_from_before_only_what_has_changed_is_added(tmp_path, ca
 def test_recordings_from_before_and_a_refit_exclude_each_other():
     recording = measured_on(bare_arm(), rows=200)
     with pytest.raises(InputError, match="leave out one of the two"):
-        improve(bare_arm(), [recording], before=[recording], refit="always")
+        improve(bare_arm(), [recording], before=[replace(recording)], refit="always")
 
 
 def test_a_wrong_diagnosis_is_not_followed(recited):

@@ -324,6 +324,69 @@ def test_before_of_another_robot_is_one_line(model, change, words, tmp_path, cap
         assert words in error[0]
 
 
+def strange_before(model, motion):
+    """A recording that the model describes, and one from before of an arm that moves otherwise."""
+    after = made(motion, 0.0)
+    other = made(smooth_walk(22), 0.0, seed=2, name="other")
+    swing = 40.0 * (other.measured - other.measured.mean(0)) @ np.array([1.0, -1.0])
+    points = other.key_points_mm + swing[:, None, None] * np.array([1.0, 0.0, 0.0])
+    return after, replace(other, key_points_mm=points)
+
+
+def test_a_model_that_does_not_describe_before_does_not_blame_after(model, tmp_path, capsys):
+    after, before = strange_before(model, smooth_walk(10))
+    found = diagnose(model, [after], before=[before])
+    error = float(np.sqrt(np.nanmean(np.square(residual_table(model, [before]).error_mm))))
+    assert (found.verdict.kind, found.verdict.reason) == ("cannot_tell", "before")
+    assert f"the model does not describe other (error {error:.3g} mm" in found.verdict.sentence
+    assert "give recordings of this arm from before the change" in found.verdict.sentence
+    assert "fit a model" not in found.verdict.sentence
+    command = found.command("arm", "after.csv", "other.csv")
+    assert command == "surgisoft diagnose arm after.csv"
+    assert found.error_mm.before < 0.1 * error
+    assert (found.ranking, found.checks, found.notes) == ((), (), ())
+    json.dumps(found.to_json())
+    save_model(model, tmp_path / "arm")
+    for each, name in ((after, "after"), (before, "other")):
+        save_recording(each, tmp_path / f"{name}.parquet")
+    command = [str(tmp_path / name) for name in ("arm", "after.parquet", "other.parquet")]
+    report = ["--report", str(tmp_path / "page")]
+    assert run(["diagnose", *command[:2], "--before", command[2], *report]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1] == f"next: surgisoft diagnose {command[0]} {command[1]}"
+    assert not any(line.startswith("effect ") for line in lines)
+    assert "<h2>Effects" not in (tmp_path / "page" / "diagnosis.html").read_text()
+
+
+def test_the_amendment_of_such_a_change_is_warned_of(model):
+    after, before = strange_before(model, smooth_walk(10))
+    both = before_and_after(residual_table(model, [after]), [before])
+    (note,) = both.notes
+    assert note.startswith("the model does not describe other (error ")
+    right = before_and_after(residual_table(model, [after]), [made(smooth_walk(22), 0.0, seed=2)])
+    assert right.strange is None
+    of_neither = before_and_after(residual_table(model, [before]), [replace(before, name="again")])
+    assert of_neither.strange is None
+    assert right.strange_in_words == ""
+
+
+def test_one_recording_before_and_after_is_refused(model, tmp_path, capsys):
+    save_model(model, tmp_path / "arm")
+    (tmp_path / "x").mkdir()
+    save_recording(made(smooth_walk(14), 0.0), tmp_path / "rec.parquet")
+    arm, rec, same = (str(tmp_path / name) for name in ("arm", "rec.parquet", "x/../rec.parquet"))
+    new = ["-o", str(tmp_path / "new")]
+    for command in (["diagnose", arm, rec], ["compare", arm, rec], ["improve", arm, rec, *new]):
+        assert run([*command, "--before", same]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith(f"surgisoft: error: {rec}: is given both before and after the cha")
+        assert error.count("\n") == 1
+    assert not (tmp_path / "new").exists()
+    one = made(smooth_walk(14), 0.0)
+    with pytest.raises(InputError, match="both before and after"):
+        diagnose(model, [one], before=[one])
+
+
 def test_pairing_without_before_is_refused(model, tmp_path, capsys):
     save_model(model, tmp_path / "arm")
     save_recording(made(smooth_walk(14), 0.0), tmp_path / "after.parquet")

@@ -42,7 +42,10 @@ def test_questions_that_cannot_be_asked_are_one_line():
     table = residual_table(model, [plain])
     for call, message in (
         (lambda: diagnose(model, [plain], without=["ghost"]), "unknown effect 'ghost'"),
-        (lambda: diagnose(model, [plain], before=[plain], refit="always"), "leave out one of the"),
+        (
+            lambda: diagnose(model, [plain], before=[replace(plain)], refit="always"),
+            "leave out one of the",
+        ),
         (lambda: diagnose(model, [plain], refit="perhaps"), "unknown refit 'perhaps'"),
         (lambda: compare(model, [unseen]), "no key point was measured in any row of the record"),
         (lambda: compare_all([model, fewer], [plain]), "key points"),

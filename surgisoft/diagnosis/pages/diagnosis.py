@@ -80,7 +80,8 @@ def diagnosis_page(found: Diagnosis, title: str, command: str = "") -> Page:
     if found.setup:
         parts.append(_setup(found.setup))
     else:
-        parts.append(Section("Effects", [_chart(found), _ranking(found)]))
+        if found.ranking:
+            parts.append(Section("Effects", [_chart(found), _ranking(found)]))
         if found.not_testable:
             rows = [(each.effect, each.reason) for each in found.not_testable]
             note = Text("These recordings cannot show these effects, so they are not ranked.")

@@ -5,7 +5,7 @@ effect of the catalogue describes to first order. `find_setup_faults` tests what
 any physics, alone and together, and names what the error on held-out blocks proves.
 """
 
-from surgisoft.diagnosis.setup.result import ModelFit, SetupResult, find_setup_faults, fit_of_model
+from surgisoft.diagnosis.setup.result import SetupResult, find_setup_faults
 from surgisoft.diagnosis.setup.words import SetupFault
 
-__all__ = ["ModelFit", "SetupFault", "SetupResult", "find_setup_faults", "fit_of_model"]
+__all__ = ["SetupFault", "SetupResult", "find_setup_faults"]

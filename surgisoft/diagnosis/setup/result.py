@@ -60,28 +60,6 @@ SLOW_OR_WRONG = (
 
 
 @dataclass(frozen=True)
-class ModelFit:
-    """How well a model predicts recordings as they are, on their training rows."""
-
-    rmse_mm: float
-    """RMS error of a key point, mm."""
-    expected_mm: float
-    """What it is with a correct set-up where nothing is missing: the model's validated error and
-    the noise of the recordings together, mm."""
-    motion_mm: float
-    """RMS motion of the key points as recorded, mm."""
-
-    @property
-    def fits(self) -> bool:
-        """Whether the recordings can be of the model's arm: it predicts most of their motion, as it
-        does whatever physics is missing. True of an arm that hardly moves, which shows nothing."""
-        if self.motion_mm <= PROOF.noticed * self.expected_mm:
-            return True
-        most = max(PROOF.left_of_motion * self.motion_mm, PROOF.noticed * self.expected_mm)
-        return self.rmse_mm <= most
-
-
-@dataclass(frozen=True)
 class SetupResult:
     """Faults in the set-up of some recordings."""
 
@@ -171,27 +149,6 @@ def find_setup_faults(model: ArmModel, recordings: Sequence[Recording]) -> Setup
     same = [name for name, result in alone.items() if result.kinds == first.kinds]
     together = _of_one_setup(model, [each for each in measured if each.name in same])
     return together or first
-
-
-def fit_of_model(model: ArmModel, recordings: Sequence[Recording]) -> ModelFit | None:
-    """How well a model predicts recordings of its arm; None where no key point is measured.
-
-    Raises InputError for recordings of another number of chambers or key points.
-    """
-    check_fits(model.spec, list(recordings), sized=False)
-    measured = [r for r in recordings if np.isfinite(r.key_points_mm).any()]
-    if not measured:
-        return None
-    sample = sample_of(model, measured, SETTINGS.fine_rows)
-    points = sample.measured()[0]
-    plain = Arrangement.as_recorded(sample.history.chambers)
-    apart = np.square(points - sample.predicted([plain])[0]).sum(2)
-    motion = np.square(points - np.nanmean(points, axis=0)).sum(2)
-    return ModelFit(
-        rmse_mm=float(np.sqrt(np.nanmean(apart))),
-        expected_mm=_levels(model, measured).reference,
-        motion_mm=float(np.sqrt(np.nanmean(motion))),
-    )
 
 
 def _levels(model: ArmModel, recordings: list[Recording]) -> Levels:

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from surgisoft.diagnosis.residuals import LEFT_OF_MOTION, NOTICED
 from surgisoft.diagnosis.setup.alignment import (
     HANDED,
     Frame,
@@ -84,12 +85,12 @@ class Proof:
     halved: float = 2.0
     """... or the factor by which the error has to fall where it falls to the level of `noticed`:
     the validated error is no exact measure of what a correct set-up reaches in other recordings."""
-    left_of_motion: float = 0.35
+    left_of_motion: float = LEFT_OF_MOTION
     """Most error that may be left, as a share of the motion of the key points: with a correct
     set-up a model of the same arm predicts most of its motion, whatever physics is missing."""
     near_validated: float = 2.0
     """... or as a multiple of the validated error and the noise together."""
-    noticed: float = 1.5
+    noticed: float = NOTICED
     """Least error before the correction, as a multiple of the validated error and the noise."""
     as_good: float = 1.25
     """Corrections whose errors differ by less than this factor do equally well: the simplest of

@@ -67,6 +67,35 @@ def test_a_folder_holds_config_weights_and_report(lab):
     assert json.loads((lab / "arm" / "config.json").read_text())["arm"]["unit"] == "kPa"
 
 
+RESULTS = {
+    "compare {arm} {rec}": "rmse_mm",
+    "diagnose {arm} {rec}": "verdict",
+    "amend {arm} --effect payload --data {rec} -o {new}": "error_mm",
+    "improve {arm} {rec} -o {new}": "rounds",
+}
+"""Commands with `--json`, and a key of their results."""
+
+
+@pytest.mark.parametrize("command", RESULTS)
+def test_only_an_older_result_of_the_same_command_is_replaced(lab, tmp_path, capsys, command):
+    """All of them look before they read a model: that there is none is the error where they may."""
+    arm, rec, new = tmp_path / "none", lab / "test.parquet", tmp_path / "new"
+    asked = command.format(arm=arm, rec=rec, new=new).split()
+    file = tmp_path / "result.json"
+    others = [key for key in RESULTS.values() if key != RESULTS[command]]
+    for content, message in (
+        ("mine", "exists already and is not an older result"),
+        (json.dumps({others[0]: 1, others[1]: 2, others[2]: 3}), "is not an older result"),
+        (json.dumps({RESULTS[command]: {}}), "no arm model there"),
+    ):
+        file.write_text(content)
+        assert run([*asked, "--json", str(file), "--report", str(tmp_path)]) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
+        assert file.read_text() == content
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

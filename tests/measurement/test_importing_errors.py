@@ -137,7 +137,23 @@ FILES = [
     ("t,u,x,y,z\n0,1,,3,4\n1,2,,4,5\n", "", "every key point is missing in every row"),
     ("t,u,x,y,z\n", "", "no rows of numbers"),
     ("", "", "the file is empty"),
-    (RAW.replace(",", ";"), "", "one column only when separated by ','; check the separator"),
+    (
+        RAW.replace(",", ";"),
+        "",
+        "one column only when separated by ','; set separator = \";\" in [file.NAME] of the map",
+    ),
+    ("t u x\n0 1 2\n", "", "one column only when separated by ','; check the separator in the map"),
+    (
+        "t;u;x;y;z\n0,0;1,5;2;3;4\n1,0;2,5;3;4;5\n",
+        "",
+        "no column 'u', the map's separator gives 1 column; set separator = \";\" and decimal = "
+        '"," in [file.NAME] of the map, as --draft writes it',
+    ),
+    (
+        "t;u;x;y;z\n0,0;1,5;2;3;4\n1,0;2,5;3;4;5\n",
+        'separator = "\\t"\ndecimal = ","',
+        "one column only when separated by '\\t'; set separator = \";\" in [file.NAME] of the map",
+    ),
     (RAW, "skip_rows = 9", "fewer than the 9 lines that the map skips"),
     ("\0\1\2" + RAW, "", "not a text file"),
 ]

@@ -89,13 +89,16 @@ class RawTable:
     """Markers of a motion capture file; marker M has columns M.x M.y M.z."""
     notes: tuple[str, ...] = ()
     """Notes about what was left out while reading."""
+    advice: str = ""
+    """What to set in the map if columns are not found; empty where nothing is known."""
 
     def position(self, column: Column) -> int:
         """Position, counted from 0, of a column by its name or its number from 1."""
         if isinstance(column, int):
             if column > len(self.names):
+                advice = f"; {self.advice}" if self.advice else ""
                 raise InputError(
-                    f"{self.path}: no column {column}, expected at most {len(self.names)}"
+                    f"{self.path}: no column {column}, expected at most {len(self.names)}{advice}"
                 )
             return column - 1
         if self.names.count(column) == 1:
@@ -114,6 +117,9 @@ class RawTable:
                 f"{named.count(column)} columns are called '{column}', expected one; "
                 "give the column's number, counted from 1"
             )
+        if self.advice:
+            count = f"{len(named)} column{'s' * (len(named) > 1)}"
+            return f"no column '{column}', the map's separator gives {count}; {self.advice}"
         near = difflib.get_close_matches(column, named, 1)
         shown = ", ".join(named[:8]) + (", ..." if len(named) > 8 else "")
         hint = f"; did you mean '{near[0]}'?" if near else ""

@@ -1,6 +1,7 @@
 """Text files of columns as raw tables: separators, decimal commas, headers, comments, torn ends."""
 
 import csv
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +9,9 @@ from pathlib import Path
 from surgisoft.errors import InputError
 from surgisoft.measurement.importing.raw import FileRole, RawTable, Reader
 from surgisoft.measurement.tables import MISSING, DelimitedText, read_text
+
+OTHER_SEPARATORS = (";", "\t", ",")
+"""Separators that are looked for where a file has not the columns that the map names."""
 
 
 def _read(path: Path, role: FileRole) -> RawTable:
@@ -25,13 +29,23 @@ def _read(path: Path, role: FileRole) -> RawTable:
             first_line += 1
             if not body or (head.strip() and not _is_comment(head, role)):
                 break
-    return table_of_body(path, role, _header(path, head, role), body, first_line)
+    names = _header(path, head, role)
+    return table_of_body(path, role, names, body, first_line, head)
 
 
 def table_of_body(
-    path: Path, role: FileRole, names: list[str], body: bytes, first_line: int
+    path: Path,
+    role: FileRole,
+    names: list[str],
+    body: bytes,
+    first_line: int,
+    header: bytes = b"",
 ) -> RawTable:
-    """The raw table of the lines below a header; no names: as many as the first line has cells."""
+    """The raw table of the lines below a header; no names: as many as the first line has cells.
+
+    header: the line of names as it is written; empty where there is none.
+    """
+    plain = body
     body = _cleaned(body, role)
     first = next((line for line in body.split(b"\n", 1000) if line), b"")
     if not first:
@@ -41,18 +55,17 @@ def table_of_body(
         )
     separator = "\t" if role.separator == "whitespace" else role.separator
     count = len(_split(first, separator, path))
+    advice = _other_separator(path, role, header, plain)
     names = names or [""] * count
     if count == len(names) + 1 and first.rstrip().endswith(separator.encode()):
         names = [*names, ""]  # each line ends with a separator
     if count == 1 and len(names) == 1:
-        raise InputError(
-            f"{path}: one column only when separated by {role.separator!r}; "
-            "check the separator in the map"
-        )
+        advice = advice or "check the separator in the map"
+        raise InputError(f"{path}: one column only when separated by {role.separator!r}; {advice}")
     body, notes = _without_torn_end(path, body, separator, len(names))
     missing = (*MISSING, *role.missing)
     cells = DelimitedText(path, body, first_line, names, separator, role.decimal, missing)
-    return RawTable(path, names, cells, notes=notes)
+    return RawTable(path, names, cells, notes=notes, advice=advice)
 
 
 def _offset_of_line(data: bytes, lines: int) -> int | None:
@@ -94,6 +107,28 @@ def _cleaned(body: bytes, role: FileRole) -> bytes:
     if role.separator == "\t" or not blank:
         return body
     return re.sub(rb"(?m)^[ \t]+$", b"", body)
+
+
+def _other_separator(path: Path, role: FileRole, header: bytes, body: bytes) -> str:
+    """What to set in the map where another separator divides header and first row into more
+    columns, as many in both; empty where none does."""
+    first = next((line for line in body.split(b"\n", 1000) if line.strip()), b"")
+    own = "\t" if role.separator == "whitespace" else role.separator
+    least = len(header.split()) if role.separator == "whitespace" else len(_cells(header, own))
+    for separator in OTHER_SEPARATORS:
+        names, cells = _cells(header, separator), _cells(first, separator)
+        if separator != own and len(names) == len(cells) > max(least, 1):
+            decimal = any(re.search(r"\d,\d", cell) for cell in cells)
+            also = ' and decimal = ","' if decimal and role.decimal != "," else ""
+            shown = json.dumps(separator)
+            return f"set separator = {shown}{also} in [file.NAME] of the map, as --draft writes it"
+    return ""
+
+
+def _cells(line: bytes, separator: str) -> list[str]:
+    """The cells of one line, by its separator alone; an end with a separator is no cell."""
+    text = line.decode("utf-8", "replace").strip("\r\n").removesuffix(separator)
+    return text.split(separator)
 
 
 def _without_torn_end(

@@ -153,12 +153,13 @@ def _even_over_effects(weights: np.ndarray, cases: Sequence[Labelled]) -> np.nda
 def log_losses(name: str, model: Logistic, some: Sequence) -> np.ndarray:
     """(N,) negative log likelihood of each case."""
     answer = []
-    for features, right, _ in some:
-        odds = model.log_odds(features)
+    for features, right, case in some:
         if name == "first":
+            odds = model.effect_odds(case.evidence)
             odds = odds - odds.max()
             answer.append(np.log(np.exp(odds).sum()) - np.log(np.exp(odds) @ right))
         else:
+            odds = model.log_odds(features)
             answer.append(np.logaddexp(0.0, odds) - right * odds)
     return np.array(answer, float)
 
@@ -177,14 +178,15 @@ def _padded(some: Sequence) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def fit_one(name: str, some: Sequence, penalty: float, twin: float = 1.0) -> Logistic:
     """One logistic model of given penalty and weight of the cases without their truth."""
     features = FEATURES[name]
-    signs = [feature.sign for feature in features]
+    signs = np.array([feature.sign for feature in features], float)
     some = [one for one in some if twin > 0.0 or not one[2].left_out]
     if not some:
         return Logistic(tuple(0.0 for _ in features))
     weights = case_weights(name, some, twin)
-    joint = name == "first"
+    joint, names = name == "first", []
     if joint:
-        x, y, there = _padded(some)
+        names = sorted({name for _, _, case in some for name in case.truth})
+        x, y, there = _padded([(_with_names(rows, case, names), r, case) for rows, r, case in some])
     else:
         x, y = np.array([row for row, _, _ in some]), np.array([right for _, right, _ in some])
 
@@ -209,9 +211,10 @@ def fit_one(name: str, some: Sequence, penalty: float, twin: float = 1.0) -> Log
         slope[-1] += off.sum()
         return float(total), slope
 
-    bounds = [(0.0 if sign > 0 else None, 0.0 if sign < 0 else None) for sign in signs]
+    bounds = [(0.0, None) if sign > 0 else (None, 0.0) for sign in signs]
+    bounds += [(None, None) for _ in names]
     bounds.append((0.0, 0.0) if joint else (None, None))
-    start = np.append(0.1 * np.array(signs, float), 0.0)
+    start = np.concatenate([0.1 * signs, np.zeros(len(names) + 1)])
     found = optimize.minimize(
         loss,
         start,
@@ -220,7 +223,15 @@ def fit_one(name: str, some: Sequence, penalty: float, twin: float = 1.0) -> Log
         bounds=bounds,
         options={"ftol": 1e-13, "gtol": 1e-8, "maxiter": 2000},
     )
-    return Logistic(tuple(float(w) for w in found.x[:-1]), float(found.x[-1]))
+    weights = [float(w) for w in found.x]
+    priors = dict(zip(names, weights[len(signs) : -1], strict=True))
+    return Logistic(tuple(weights[: len(signs)]), weights[-1], priors)
+
+
+def _with_names(rows: np.ndarray, case: Labelled, names: Sequence[str]) -> np.ndarray:
+    """(E, F + M) features of a case's effects, and whether each one has each of M names."""
+    own = np.array([one.effect for one in case.evidence.effects])
+    return np.hstack([rows, own[:, None] == np.array(names)])
 
 
 def _robot_folds(cases: Sequence[Labelled]) -> list[np.ndarray]:
@@ -360,6 +371,11 @@ def fit(cases: Sequence[Labelled], command: str = "") -> dict:
                 feature.name: round(weight, 6)
                 for feature, weight in zip(FEATURES[name], model.weights, strict=True)
             },
+            **(
+                {"priors": {n: round(v, 6) for n, v in model.priors.items()}}
+                if model.priors
+                else {}
+            ),
             "penalty": settings[name].penalty,
             "twin_weight": settings[name].twin,
             "cases": sum(not case.left_out for _, _, case in samples[name]),
@@ -391,7 +407,7 @@ def about(source: str, cases: Sequence[Labelled]) -> dict:
 def model_of(values: dict) -> DecisionModel:
     """The decision of an asset's values."""
     models = {
-        name: Logistic(tuple(one["weights"].values()), one["constant"])
+        name: Logistic(tuple(one["weights"].values()), one["constant"], one.get("priors", {}))
         for name, one in values["models"].items()
     }
     return decision_of(models, values)

@@ -13,8 +13,8 @@ probabilities:
 
 So P(e) = P(missing) P(known) P(e | known), and two effects e and f are both missing with the
 probability (P(e) + P(f)) P(both | one of them). Every weight of a feature has a fixed sign: more
-evidence for a statement never makes it less probable. Only the prior weights of the effects
-(`PRIOR_EFFECTS`) may have either. The probabilities of the most probable effect and of the two most
+evidence for a statement never makes it less probable. Only the prior log odds of the effects may
+have either (`Logistic.priors`). The probabilities of the most probable effect and of the two most
 probable ones are products of three fits; two curves calibrate them (Platt 1999), and what remains
 to 1 is shared by the others as before. Each statement that could be made has one
 probability (`Statement`), and the result is the one whose worth to its reader, weighed with it, is
@@ -27,7 +27,7 @@ import hashlib
 import json
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -83,25 +83,6 @@ FORM_SHARE = 0.02
 """Share of what an effect explains that its formula gets wrong on a real arm: two effects whose
 changes differ by less are not told apart by how sure the blocks are, and a second one that explains
 less besides is not told from the first one's form."""
-PRIOR_EFFECTS = (
-    "hysteresis",
-    "creep",
-    "line_lag",
-    "rate_dependence",
-    "dead_zone",
-    "drift",
-    "coupling",
-    "gain_mismatch",
-    "misalignment",
-    "payload",
-    "contact",
-    "softening",
-    "stiffening",
-    "twist",
-)
-"""Effects with a fitted prior weight: those that are missing in cases of the fit. It says how often
-an effect is the cause where it explains as much as others. Some imitate many causes and seldom are
-it; softening and twist imitate few. Every other effect, such as a user's own, has the weight 0."""
 CLEAR_JUMPS = 0.2
 """Level of new jumps over the error (`Evidence.jumps`) that counts in full, and from which on they
 are mentioned. The inner loss of the fits is flat about it (docs/results/decision.md)."""
@@ -123,8 +104,7 @@ class Feature:
     name: str
     """Its name in the asset."""
     sign: int
-    """+1: more of it makes the statement more probable; -1: less probable; 0: its weight may have
-    either sign."""
+    """+1: more of it makes the statement more probable; -1: less probable."""
     of: Callable[..., float]
     """Computes it from the evidence; for `first` from an effect's evidence and all of it."""
     meaning: str
@@ -342,13 +322,6 @@ def _least_unique(evidence: Evidence) -> float:
     pair = _pair(evidence)
     own = [each for each in evidence.effects if pair and each.effect in pair.effects]
     return min((_unique_share(each, evidence) for each in own), default=0.0)
-
-
-def _prior(name: str) -> "Feature":
-    """The feature that is 1 for the effect of a name."""
-    return Feature(
-        f"prior_{name}", 0, lambda x, e: float(x.effect == name), f"1 for `{name}`, 0 for others"
-    )
 
 
 def _leaves_more(effect: EffectEvidence, evidence: Evidence) -> float:
@@ -584,7 +557,6 @@ FIRST = (
         ),
         "size of what an effect of exact form leaves",
     ),
-    *(_prior(name) for name in PRIOR_EFFECTS),
 )
 TWO = (
     Feature(
@@ -664,10 +636,19 @@ class Logistic:
     """One for each feature."""
     constant: float = 0.0
     """Log odds where all features are 0."""
+    priors: Mapping[str, float] = field(default_factory=dict)
+    """In the model of which effect it is the prior log odds of each effect; 0 for one that is not
+    among them, such as a user's own. They say how often an effect is the cause where it explains as
+    much as others: some imitate many causes and seldom are it, others imitate few."""
 
     def log_odds(self, features: np.ndarray) -> np.ndarray:
         """(...) log odds of features (..., F)."""
         return self.constant + np.asarray(features, float) @ np.asarray(self.weights)
+
+    def effect_odds(self, evidence: Evidence) -> np.ndarray:
+        """(E,) log odds of each effect in the model of which one it is, up to a constant."""
+        priors = [self.priors.get(one.effect, 0.0) for one in evidence.effects]
+        return self.log_odds(features_of("first", evidence)) + np.array(priors, float)
 
 
 @dataclass(frozen=True)
@@ -743,7 +724,9 @@ def load_decision(path: Path = ASSET) -> DecisionModel:
                 f"{path.name}: model '{name}' has a weight that is not a finite number; fit it "
                 "again"
             )
-        models[name] = Logistic(tuple(map(float, weights.values())), numbers[-1])
+        models[name] = Logistic(
+            tuple(map(float, weights.values())), numbers[-1], _priors(one, path)
+        )
     curves = values.get("calibration", {})
     if not isinstance(curves, dict):
         raise InputError(f"{path.name}: calibration is not a table; fit it again")
@@ -752,6 +735,14 @@ def load_decision(path: Path = ASSET) -> DecisionModel:
         if name not in CALIBRATED or not all(_finite(given.get(k)) for k in ("constant", "slope")):
             raise InputError(f"{path.name}: calibration '{name}' is not readable; fit it again")
     return decision_of(models, values)
+
+
+def _priors(model: dict[str, Any], path: Path) -> dict[str, float]:
+    """The prior log odds of a model's entry in an asset; raises InputError for damaged ones."""
+    priors = model.get("priors", {})
+    if not isinstance(priors, dict) or not all(map(_finite, priors.values())):
+        raise InputError(f"{path.name}: priors are not a table of finite numbers; fit it again")
+    return {name: float(value) for name, value in priors.items()}
 
 
 def _finite(value: Any) -> bool:
@@ -826,7 +817,7 @@ def probabilities(evidence: Evidence, model: DecisionModel | None = None) -> Pro
     network = 0.0 if evidence.paired else chance("network")
     share = np.zeros(0)
     if evidence.effects:
-        odds = model.models["first"].log_odds(features_of("first", evidence))
+        odds = model.models["first"].effect_odds(evidence)
         share = np.exp(odds - odds.max())
         share /= share.sum()
     each = {one.effect: float(p) for one, p in zip(evidence.effects, share, strict=True)}

@@ -49,7 +49,6 @@ from surgisoft.diagnosis.criteria import CLAIM, WORTH, Claim, Worth
 from surgisoft.diagnosis.decision import (
     ASSET,
     FEATURES,
-    PRIOR_EFFECTS,
     Curve,
     Decision,
     Logistic,
@@ -144,7 +143,7 @@ def test_the_conditional_logit_is_a_softmax():
     some = sample("first", some_cases())
     model = fit_one("first", some, 0.3)
     rows = features_of("first", GOOD)
-    odds = rows @ np.array(model.weights)
+    odds = rows @ np.array(model.weights) + [model.priors["creep"], 0.0]
     share = np.exp(odds) / np.exp(odds).sum()
     one = [(rows, np.array([1.0, 0.0]), case(0))]
     assert log_losses("first", model, one)[0] == pytest.approx(-np.log(share[0]))
@@ -195,29 +194,26 @@ def test_two_effects_are_asked_about_where_one_of_them_is_missing():
     assert [(one.case, float(right)) for _, right, one in some] == [("0", 1), ("1", 0), ("3", 0)]
 
 
-def test_an_effect_that_imitates_others_has_the_lesser_prior_weight():
-    """Both always explain alike. Where only creep is ever missing, it has the larger weight; where
-    both are, they have the same, though one was drawn three times as often."""
+def test_an_effect_that_is_seldom_the_cause_has_the_lesser_prior_odds():
+    """Both always explain alike. Where only creep is ever missing, it has prior odds, and the lag,
+    of which there are no cases, has none; where both are, they have the same, though one was drawn
+    three times as often."""
     twins = replace(GOOD, effects=(CREEP, replace(CREEP, effect="line_lag")))
     creep, lag = (
         sample("first", [case(n, truth=(name,), evidence=twins) for n in range(number)])
         for name, number in (("creep", 30), ("line_lag", 10))
     )
 
-    def priors(some):
-        weights = fit_one("first", some, 1.0).weights
-        found = dict(zip([f.name for f in FEATURES["first"]], weights, strict=True))
-        return [found[f"prior_{name}"] for name in ("creep", "line_lag", "drift")]
-
-    often, seldom, never = priors(creep)
-    assert often > 0.5 > -0.5 > seldom
-    assert never == pytest.approx(0.0, abs=1e-9)
-    assert priors(creep + lag) == pytest.approx([0.0, 0.0, 0.0], abs=1e-6)
+    often = fit_one("first", creep, 1.0)
+    assert list(often.priors) == ["creep"]
+    assert often.priors["creep"] > 0.5
+    even = fit_one("first", creep + lag, 1.0)
+    assert even.priors == pytest.approx({"creep": 0.0, "line_lag": 0.0}, abs=1e-6)
 
 
-def test_the_effects_with_a_prior_weight_are_those_that_are_missing_in_stored_cases():
-    known = [one for one in evidence() if one.label == "known"]
-    assert {name for one in known for name in one.truth} == set(PRIOR_EFFECTS)
+def test_the_asset_has_prior_odds_of_every_effect_with_cases():
+    missing = {name for one in evidence() if one.label == "known" for name in one.truth}
+    assert set(json.loads(ASSET.read_text())["models"]["first"]["priors"]) == missing
 
 
 def test_a_calibration_gives_back_how_often_effects_are_missing():
@@ -370,6 +366,7 @@ def test_the_stored_evidence_gives_the_weights_of_the_asset(name):
     model = fit_one(name, sample(name, evidence()), one["penalty"], one["twin_weight"])
     assert model.constant == pytest.approx(one["constant"], abs=0.01)
     assert model.weights == pytest.approx(list(one["weights"].values()), abs=0.01)
+    assert dict(model.priors) == pytest.approx(one.get("priors", {}), abs=0.01)
 
 
 def test_stated_values_are_varied_one_at_a_time():

@@ -13,7 +13,6 @@ from surgisoft.diagnosis.criteria import CLAIM, Worth
 from surgisoft.diagnosis.decision import (
     ASSET,
     FEATURES,
-    PRIOR_EFFECTS,
     SCHEMA,
     Curve,
     DecisionModel,
@@ -411,12 +410,15 @@ def test_an_effect_is_unique_by_its_share_of_what_returns():
     assert features_of("two", evidence)[place] == pytest.approx(0.2)
 
 
-def test_only_a_listed_effect_has_a_prior_weight():
-    rows = features_of("first", replace(GOOD, effects=(CREEP, replace(LAG, effect="my_own"))))
-    places = [number for number, f in enumerate(FEATURES["first"]) if f.sign == 0]
-    assert [FEATURES["first"][n].name for n in places] == [f"prior_{n}" for n in PRIOR_EFFECTS]
-    assert rows[0, places].sum() == rows[0, places[PRIOR_EFFECTS.index("creep")]] == 1.0
-    assert not rows[1, places].any()
+def test_an_effect_has_its_prior_odds_and_one_without_has_none():
+    """Of three that explain alike the shares are 3, 1/2 and 1, over their sum."""
+    three = tuple(replace(CREEP, effect=name) for name in ("creep", "line_lag", "my_own"))
+    model = given_odds()
+    odds = {"creep": math.log(3.0), "line_lag": -math.log(2.0), "drift": 5.0}
+    model.models["first"] = replace(model.models["first"], priors=odds)
+    found = probabilities(replace(GOOD, effects=three), model)
+    chances = [found.effects[one.effect] / found.known for one in three]
+    assert chances == pytest.approx([3.0 / 4.5, 0.5 / 4.5, 1.0 / 4.5])
 
 
 @settings(max_examples=60, deadline=None)
@@ -488,6 +490,7 @@ def test_features_are_finite_of_order_one():
         (lambda v: v.update(schema=99), "schema 99"),
         (lambda v: v.update(schema=SCHEMA - 1), f"expected {SCHEMA}; fit it again"),
         (lambda v: v["models"]["missing"]["weights"].pop("above_floor"), "hash"),
+        (lambda v: v["models"]["first"]["priors"].update(creep=9.0), "hash"),
     ],
 )
 def test_a_damaged_asset_is_refused_in_one_line(tmp_path, change, told):

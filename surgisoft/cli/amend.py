@@ -70,7 +70,8 @@ def amend(
         typer.Option(
             "--keep-network",
             help="Do not change the network. By default its last layer is fitted again with the "
-            "effects if that lowers the error on held-out data.",
+            "effects if that lowers the error in every quarter of the training part that is left "
+            "out of both fits.",
         ),
     ] = False,
     refit: Refit = "auto",
@@ -136,8 +137,8 @@ def amend(
     show_parameters(result.parameters, result.in_words)
     if result.retuned:
         print(
-            "the network's last layer was fitted again, which lowers the error on motion that was "
-            "left out of that fit"
+            "the network's last layer was fitted again, which lowers the error in every quarter of "
+            "the training part that was left out of both fits"
         )
     if result.refit is not None:
         print(f"{result.refit.sentence}, with parts of the training data left out")

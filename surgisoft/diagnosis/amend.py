@@ -220,7 +220,12 @@ class Amendment:
             return f"{text}, its network's last layer re-tuned" if self.retuned else text
         if not self.retuned:
             return text
-        return f"{text}; {self.held_out.after:.3f} mm with the network's last layer re-tuned"
+        if not self.claimed:
+            return f"{text}; {self.held_out.after:.3f} mm with the network's last layer re-tuned"
+        return (
+            f"{' + '.join(self.effects)}: {self.held_out.sentence}, with the network's last layer "
+            f"re-tuned; {self.alone.after:.3f} mm with the effects alone"
+        )
 
     @property
     def _together(self) -> str:
@@ -302,7 +307,8 @@ def amend(
 
     effects: names, or files of user-defined effects (`my_effect.py`), which are run.
     retune_network: also re-tune the network's last layer, where the effects alone make the error of
-    the training rows fall and motion that is left out among them rewards it. before: recordings
+    the training rows fall and the new layer lowers it in every quarter of them that is left out of
+    both fits (`estimation.network`). before: recordings
     from before a change. Where they were made with the same actuation, effects are fitted to the
     paired difference (`pairs`), so that the network's error does not enter; paired: as for
     `diagnose`.
@@ -378,7 +384,8 @@ def amend(
             tell("re-tuning the network")
             # Tuned to what was measured: the network's own error is not in a paired difference.
             rows = plain.training()
-            tried = retune(better, rows)
+            # In a paired difference the effects are fitted to other residuals than the layer.
+            tried = retune(better, rows, () if both is not None and both.used else names)
             pair = rows.with_model(better), rows.with_model(tried.model)
             if tried.kept and fall_of(*pair).significant:
                 better, retuned = tried.model, True

@@ -222,7 +222,7 @@ def test_a_network_is_retuned_behind_an_effect_that_is_there_and_earns_it_no_cla
     off = bare_arm()
     with torch.no_grad():
         off.network.layers[-1].bias += 0.02
-    with_creep = measured_on(TRUTHS["creep"])
+    with_creep = measured_on(TRUTHS["creep"], rows=800)
     both, kept = (amend(off, [with_creep], ["creep"], tune) for tune in (True, False))
     assert both.claimed
     assert both.retuned
@@ -270,7 +270,8 @@ def test_the_last_layer_is_tuned_on_training_rows_alone(lab, monkeypatch):
     """What `retune` is given holds no measurement of a held-out row."""
     seen = []
 
-    def retune(model, problem):
+    def retune(model, problem, effects):
+        assert effects == ["creep"]
         seen.append(problem.table)
         return Retuned(model, False, 0.0)
 
@@ -295,7 +296,7 @@ def test_a_layer_that_held_out_motion_does_not_reward_is_not_changed():
 def test_a_tuned_layer_that_makes_the_error_larger_is_not_kept(lab, monkeypatch):
     """Whatever the tuning says of itself: the network's output is moved by 1 mm here."""
 
-    def worse(model, problem):
+    def worse(model, problem, effects):
         network = copy.deepcopy(model.network)
         with torch.no_grad():
             network.mean += 1.0

@@ -212,9 +212,7 @@ def test_tables_follow_the_confidence_that_they_print():
 
 QUIET = Round("nothing_missing", "no effect is missing; error 0.1 mm", None, (), None, 0.1, 0.1)
 ADDED = Round("identified", "creep is missing", "creep", (), 0.9, 0.2, 0.2)
-TUNED = Round(
-    "surrogate_undertrained", "a re-tuned network lowers it", "network", (), None, 0.1, 0.1
-)
+TUNED = Round("retuned", "a re-tuned network lowers it", "network", (), None, 0.1, 0.1)
 
 
 @pytest.mark.parametrize(

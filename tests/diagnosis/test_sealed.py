@@ -51,7 +51,11 @@ def test_the_axis_that_an_unknown_effect_is_described_by(pair):
 
 
 def test_an_amended_model_and_its_parameters(pair):
-    results = [amend(default_arm(), [each], "gain_mismatch", refit="never") for each in pair]
+    """The network is off by a constant, so that its last layer is re-tuned, too."""
+    off = default_arm()
+    with torch.no_grad():
+        off.network.layers[-1].bias += 0.1
+    results = [amend(off, [each], "gain_mismatch", refit="never") for each in pair]
     assert results[0].parameters == results[1].parameters
     assert results[0].training == results[1].training
     assert results[0].alone.p_value == results[1].alone.p_value

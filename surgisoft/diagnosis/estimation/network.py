@@ -8,9 +8,16 @@ is linear, so its best change D is a ridge regression in the activations h of th
 whose second term holds the network's shape over its whole range of actuation, also where the
 recordings do not go; a shift of everything is free. Residuals behind body and sensor effects are
 taken for those of the network: what these effects turn or bend is small.
+
+The ridge is the one with the least error on motion that is held out in turn, so that error says too
+little about whether the new layer helps: the ridge was selected on it, and the effects in front of
+the network were fitted to all of it. So the layer is judged once more, by a nested validation
+(Varma & Simon 2006): each quarter of the time is left out of the fit of the effects, of the choice
+of the ridge and of the layer, and the layer is kept only where it lowers the error in every one.
 """
 
 import copy
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,8 +25,10 @@ import torch
 from scipy import stats
 from torch import Tensor, nn
 
+from surgisoft.diagnosis.estimation.effects import fit_effects
 from surgisoft.diagnosis.estimation.nuisance import held_out_parts
 from surgisoft.diagnosis.residuals import Problem
+from surgisoft.diagnosis.statistics import block_interval, block_sums
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import HawNN
 
@@ -31,6 +40,9 @@ LEAST_GAIN = 0.05
 """Least fall of the held-out squared error that is worth a change, as a share of it."""
 CHANCE = 0.025
 """Chance of so large a gain if there were none, one-sided."""
+QUARTERS = 4
+"""Stretches of time that are left out of effects and layer in turn; each is as long a part of the
+training rows as the held-out rows are of a recording."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,18 +52,68 @@ class Retuned:
     model: ArmModel
     """The model with the new layer, or the old one where that was not rewarded."""
     kept: bool
-    """Whether held-out motion rewards the new layer."""
+    """Whether every left-out quarter rewards the new layer."""
     gain: float
-    """Fall of the held-out squared error, as a share of it."""
+    """Fall of the squared error over the quarters that were left out of both fits, as a share of
+    it; where the layer was rejected before they were looked at, over the parts that its ridge was
+    chosen on."""
+
+
+def retune(model: ArmModel, problem: Problem, effects: Iterable[str] = ()) -> Retuned:
+    """Re-tune the last layer of a model's network on a problem's rows; the given one stays.
+
+    effects: names of the model's effects that were fitted to these rows. They are fitted again
+    without each left-out quarter, so that no step has seen it. Effects that are not named stay.
+    """
+    if not isinstance(model.network, HawNN):
+        return Retuned(model, False, 0.0)
+    problem = problem.with_model(model)
+    tuned = _tuned(model, problem)
+    if not tuned.kept:
+        return tuned
+    before = after = 0.0
+    for out in _quarters(problem):
+        unseen = problem.without_blocks(~out)
+        alone, both = _fitted_without(problem.without_blocks(out), tuple(effects))
+        sums = [_squares(unseen.with_model(each)) for each in (alone, both)]
+        if not _falls(*sums):
+            return Retuned(model, False, 1.0 - float(sums[1].sum() / sums[0].sum()))
+        before, after = before + float(sums[0].sum()), after + float(sums[1].sum())
+    return Retuned(tuned.model, True, 1.0 - after / before)
+
+
+def _quarters(problem: Problem) -> Iterator[np.ndarray]:
+    """(B,) bool, one for each stretch of time: the blocks that belong to it."""
+    count = len(problem.motion)
+    for blocks in np.array_split(np.arange(count), min(QUARTERS, count)):
+        yield np.isin(np.arange(count), blocks)
+
+
+def _fitted_without(inside: Problem, effects: tuple[str, ...]) -> tuple[ArmModel, ArmModel]:
+    """The models without and with a new layer that the rows of a problem lead to."""
+    alone = fit_effects(inside, list(effects)).model if effects else inside.model
+    return alone, _tuned(alone, inside.with_model(alone)).model
+
+
+def _squares(problem: Problem) -> np.ndarray:
+    """(B,) sum of squared residuals of each block of time, mm^2."""
+    return block_sums(np.nansum(np.square(problem.residual), axis=(1, 2)), problem.block)
+
+
+def _falls(before: np.ndarray, after: np.ndarray) -> bool:
+    """Whether sums of squares (B,) of blocks fall: the 95 % interval of the fall is above zero."""
+    low, _ = block_interval(np.subtract, (before, after))
+    return bool(low > 0)
 
 
 @torch.no_grad()
-def retune(model: ArmModel, problem: Problem) -> Retuned:
-    """Re-tune the last layer of a model's network on a problem's rows; the given one stays."""
+def _tuned(model: ArmModel, problem: Problem) -> Retuned:
+    """The layer that fits a problem best, kept where motion that is held out in turn rewards it.
+
+    problem: with the residuals of the model.
+    """
     network = model.network
-    if not isinstance(network, HawNN):
-        return Retuned(model, False, 0.0)
-    problem = problem.with_model(model)
+    assert isinstance(network, HawNN)
     trace = model.trace(problem.history)
     hidden = _hidden(
         network,

@@ -34,6 +34,7 @@ from surgisoft.diagnosis.data_quality import (
 from surgisoft.diagnosis.decision import (
     CLEAR_JUMPS,
     CLEAR_SHIFT,
+    MOSTLY_STATIC,
     Decision,
     Kind,
     Probabilities,
@@ -55,7 +56,7 @@ from surgisoft.diagnosis.inputs import (
 )
 from surgisoft.diagnosis.other_models import open_model
 from surgisoft.diagnosis.pairs import BeforeAfter, Change, ChangeTrack, Paired, before_and_after
-from surgisoft.diagnosis.refit import LINE_OR_WALL, Refit, can_hide, refit_reason
+from surgisoft.diagnosis.refit import LINE_OR_WALL, Refit, beside, can_hide, refit_reason
 from surgisoft.diagnosis.refit import refit as fit_candidates_together
 from surgisoft.diagnosis.residuals import Problem, Sealed, residual_table
 from surgisoft.diagnosis.selection import (
@@ -98,12 +99,15 @@ FITTED_STAGES = ("line", "material")
 MOST_FITTED = 3
 """Most effects that a fit is recommended with; `fit` takes those that lower its held-out error."""
 REASONS = {
-    "network": "a function of the actuation alone explains most of the error, which is larger than "
-    "the model's validated error, so the model does not describe this arm: fit a model to these "
+    "network": "the error is {size}, so the model does not describe this arm: fit a model to these "
     "recordings",
-    "learned": "the error is about as large as the model's validated error, and a black box with "
-    "memory explains a part of it that no static function explains, so the network has learned "
-    "part of the missing effect: fit a network together with effects",
+    "static": "a function of the actuation alone explains most of the error, which is {size}: fit "
+    "a model to these recordings",
+    "learned": "the error is {size}, and a black box with memory explains a part of it that no "
+    "static function explains, so the network has learned part of the missing effect: fit a "
+    "network together with effects",
+    "announced": "the error is {size}, and most probably it is the network's own; it needs a "
+    "longer fit, more data or a better form",
     "repeatability": "most probably nothing has changed, but the change is not clearly as small as "
     "the differences between recordings of an unchanged arm: record the same schedule twice before "
     "a change, so that these differences are known",
@@ -111,7 +115,8 @@ REASONS = {
     "few_data": "the recordings contain too few different motions",
     "schedule": "several causes explain these recordings about equally well, and none well enough",
 }
-"""Why a diagnosis cannot tell, in words."""
+"""Why a diagnosis cannot tell, or why it calls the model off, in words; {size}: the error beside
+the validated one (`ErrorLevels.size`)."""
 
 MENTIONED = {
     "identified": "{} is missing",
@@ -160,6 +165,23 @@ class ErrorLevels:
     best_achievable: float
     """Best achievable error: the least that the model, a black box, any effect or the named effects
     leave on held-out blocks."""
+    validated: float | None = None
+    """The model's validated error, with the noise of these recordings instead of that of its fit,
+    so that `before` can be compared with it; None for a paired difference, which holds no error of
+    the model, and where the set-up is at fault."""
+    discrepancy_alone: float | None = None
+    """Error that the model discrepancy alone, without an effect, leaves on held-out blocks: what
+    the error with each effect is compared with. None where the set-up is at fault."""
+
+    @property
+    def size(self) -> str:
+        """The error beside the validated one in words, with the number that it is compared with."""
+        if self.validated is None:
+            return "of unknown size beside the model's validated error"
+        return (
+            f"{beside(self.before, self.validated)} the model's validated error "
+            f"({self.validated:.3g} mm with the noise of these recordings)"
+        )
 
 
 @dataclass(frozen=True)
@@ -564,9 +586,16 @@ def result_of(found: Findings, decision: Decision | None = None) -> Diagnosis:
     in_fit = problem.in_fit
     where = LEFT_OUT if in_fit else HELD_OUT
     kind, effects, sure = decision.kind, decision.effects, decision.confidence
-    levels = ErrorLevels(problem.rmse_mm, problem.floor_mm, best.rmse_mm)
+    levels = ErrorLevels(
+        problem.rmse_mm,
+        problem.floor_mm,
+        best.rmse_mm,
+        validated=None if evidence.paired else problem.rmse_mm / evidence.error_over_validated,
+        discrepancy_alone=found.selection.rmse_mm(found.selection.losses()),
+    )
     ranking = tuple(_ranked(found, score, decision) for score in _order(found, decision))
-    sentence = sentence_of(decision, levels, _reached(found, effects, kind), where)
+    static = evidence.free_static >= MOSTLY_STATIC * evidence.free_box
+    sentence = sentence_of(decision, levels, _reached(found, effects, kind), where, static)
     others = _instead(evidence) if kind == "several" else ()
     if others:
         sentence += (
@@ -617,8 +646,8 @@ def would_explain(found: Findings, decision: Decision) -> list[str]:
         return []
     text = (
         f"{best.effect} would explain {100 * best.gain:.0f} % of the explainable error, but the "
-        f"error is no larger than the model's validated error, so an error of the fit explains it "
-        f"as well"
+        f"error is no larger than the model's validated error (both without their noise), so an "
+        f"error of the fit explains it as well"
     )
     if known_effects()[best.effect].stage in ("line", "material"):
         text += f"; fit the network together with it (fit --effects {best.effect}) and compare"
@@ -773,10 +802,15 @@ def _share(value: float) -> float:
 
 
 def sentence_of(
-    decision: Decision, levels: ErrorLevels, reached: Sequence[float], where: str = HELD_OUT
+    decision: Decision,
+    levels: ErrorLevels,
+    reached: Sequence[float],
+    where: str = HELD_OUT,
+    static: bool = False,
 ) -> str:
     """The verdict in words. reached: error with the named effects, or with each of a set, on blocks
-    that these were not fitted to, mm; where: these blocks in words."""
+    that these were not fitted to, mm; where: these blocks in words; static: whether a function of
+    the actuation alone explains most of what can be explained."""
     kind, effects, sure = decision.kind, decision.effects, decision.confidence
     error = f"error {levels.before:.3g} mm, floor {levels.floor:.3g} mm"
     if kind == "identified":
@@ -806,16 +840,22 @@ def sentence_of(
             f"{f'nearest: {near}' if near else 'none is near'}); {error}"
         )
     if kind == "surrogate_undertrained":
-        why = "its validated error is as large; it needs a longer fit, more data or a better form"
-        if decision.reason:
-            why = REASONS[decision.reason]
+        why = _why(decision.reason or "announced", levels, static)
         head = f"the model itself is off (confidence {sure:.2f}), so no effect is sought yet"
         return f"{head}: {why}; {error}"
     if kind == "cannot_tell":
-        why, most = REASONS[decision.reason or "schedule"], _most_probable(decision)
+        why = _why(decision.reason or "schedule", levels, static)
+        most = _most_probable(decision)
         most = f" (most probable: {most})" if most else ""
         return f"cannot tell what is missing, if anything: {why}{most}; {error}"
     return f"these recordings show no missing effect; {error}"
+
+
+def _why(reason: str, levels: ErrorLevels, static: bool) -> str:
+    """A reason in words: what is said of the error follows from the numbers."""
+    if reason == "network" and static:
+        reason = "static"
+    return REASONS[reason].format(size=levels.size)
 
 
 def _most_probable(decision: Decision) -> str:

@@ -258,9 +258,9 @@ def refit_reason(problem: Problem, mode: str) -> str:
 def reason_to_refit(problem: Problem) -> str:
     """Why the residuals of a model cannot decide and a refit can; empty where they can.
 
-    The error is far above the noise floor, and no larger than the validated error, or most rows are
-    those that the model was fitted to, where a larger error is no change of the arm: an effect that
-    the network has learned to imitate would look like this.
+    The error is far above the noise floor, and without noise at most 1.2 times (`ASKED.within`) the
+    validated one, or most rows are those that the model was fitted to, where a larger error is no
+    change of the arm: an effect that the network has learned to imitate would look like this.
     """
     error, floor = problem.rmse_mm, problem.floor_mm
     seen = np.isfinite(problem.residual).all(2).sum(0)
@@ -271,13 +271,24 @@ def reason_to_refit(problem: Problem) -> str:
     of_fit = (problem.in_fit or 0.0) >= ASKED.of_fit
     if (excess > ASKED.within * validated and not of_fit) or not problem.model.trainable:
         return ""
-    size = f"no larger than the model's validated error ({validated:.3g} mm)"
+    size = (
+        f"without noise, at {excess:.3g} mm, {beside(excess, validated)} the model's validated "
+        f"error ({validated:.3g} mm without its noise)"
+    )
     if excess > ASKED.within * validated:
-        size = "these are the recordings that the model was fitted to"
+        size = f"the model was fitted to {problem.in_fit:.0%} of these rows"
     return (
         f"the error ({error:.3g} mm) is far above the noise floor ({floor:.3g} mm) and {size}, so "
         "the network may imitate what is missing"
     )
+
+
+def beside(value: float, reference: float) -> str:
+    """A size beside a reference in words, to stand before the reference: as the numbers are."""
+    if value <= reference:
+        return "no larger than"
+    ratio = value / reference if reference > 0.0 else np.inf
+    return f"{ratio:.3g} times" if ratio >= 1.005 else "as large as"
 
 
 LINE: Stage = "line"

@@ -91,6 +91,10 @@ def test_compare_and_diagnose_give_one_floor_and_one_best_achievable_error(model
     found = diagnose(model, made)
     result, table = compare(model, made)
     best = found.error_mm.best_achievable
+    assert found.error_mm.before / found.error_mm.validated == pytest.approx(
+        found.statistics.error_over_validated
+    )
+    assert best <= found.error_mm.discrepancy_alone <= 1.01 * found.error_mm.before
     assert result.best_achievable.rmse_mm == best
     assert result.floor.rmse_mm == pytest.approx(found.error_mm.floor, rel=1e-12)
     assert result.floor.source == source

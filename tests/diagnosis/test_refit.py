@@ -126,13 +126,25 @@ def test_a_lag_that_the_network_imitates_is_named(problem, found):
     assert time == pytest.approx(LAG_S, rel=0.35)
 
 
+@pytest.mark.parametrize(
+    ("share", "words"),
+    [(1.0, "no larger than"), (0.999, "as large as"), (0.9, "1.11 times")],
+)
+def test_the_reason_compares_the_numbers_that_it_prints(problem, share, words):
+    """Validated errors that are a share of the error, both without noise."""
+    excess = np.sqrt(problem.rmse_mm**2 - problem.floor_mm**2)
+    alike = np.full_like(problem.discrepancy_mm, share * excess)
+    text = f"at {excess:.3g} mm, {words} the model's validated error ({share * excess:.3g} mm "
+    assert text in reason_to_refit(replace(problem, discrepancy_mm=alike))
+
+
 def test_a_larger_error_is_no_change_on_the_rows_of_the_fit(problem):
     """Five times the validated error: on the rows of the fit the network may still imitate a lag;
     on other rows the arm may have changed."""
     known = problem.model.fitted_rows
     larger = replace(problem, discrepancy_mm=problem.discrepancy_mm / 5.0)
     assert larger.in_fit == 1.0
-    assert "these are the recordings that the model was fitted to" in reason_to_refit(larger)
+    assert "the model was fitted to 100% of these rows" in reason_to_refit(larger)
     problem.model.fitted_rows = replace(known, hashes=())
     try:
         assert larger.in_fit == 0.0

@@ -127,7 +127,7 @@ def test_an_improvement_says_what_was_added():
 
 CHANCES = Probabilities(0.1, 0.1, 0.1, {"creep": 0.5, "drift": 0.2}, 0.0, ())
 NONE = Probabilities(0.1, 0.1, 0.8, {}, 0.0, ())
-LEVELS = ErrorLevels(0.5, 0.1, 0.2)
+LEVELS = ErrorLevels(0.5, 0.1, 0.2, validated=0.4)
 STATEMENTS = (
     Statement("identified", ("creep",), 0.4, 0.3),
     Statement("ambiguous", ("creep", "drift"), 0.9, 0.2),
@@ -151,7 +151,7 @@ def decision(kind, *effects, reason=None, chances=CHANCES, statements=()) -> Dec
         (decision("unknown_effect"), "none of the known ones (confidence 0.75; nearest: creep",
          ""),
         (decision("unknown_effect", chances=NONE), "(confidence 0.75; none is near)", ""),
-        (decision("surrogate_undertrained"), "its validated error is as large; it needs a longer",
+        (decision("surrogate_undertrained"), "and most probably it is the network's own; it needs",
          "surgisoft fit {data} -o NEW"),
         (decision("surrogate_undertrained", reason="network"), "the model does not describe this a",
          "surgisoft fit {data} -o NEW"),
@@ -171,6 +171,35 @@ def decision(kind, *effects, reason=None, chances=CHANCES, statements=()) -> Dec
 def test_each_kind_of_result_has_its_sentence_and_its_next_command(given, sentence, command):
     assert sentence in sentence_of(given, LEVELS, [0.15])
     assert next_command(given) == command
+
+
+@pytest.mark.parametrize("reason", [None, "network", "learned"])
+@pytest.mark.parametrize(
+    ("validated", "size"),
+    [
+        (
+            0.4,
+            "the error is 1.25 times the model's validated error (0.4 mm with the noise of these",
+        ),
+        (0.499, "the error is as large as the model's validated error (0.499 mm with the noise"),
+        (0.5, "the error is no larger than the model's validated error (0.5 mm with the noise"),
+        (0.6, "the error is no larger than the model's validated error (0.6 mm with the noise"),
+    ],
+)
+def test_the_error_is_called_as_large_as_it_is_beside_the_validated_one(reason, validated, size):
+    """What is compared is printed, and the words follow from it."""
+    given = decision("surrogate_undertrained", reason=reason)
+    text = sentence_of(given, replace(LEVELS, validated=validated), [])
+    assert size in text
+    assert text.endswith("; error 0.5 mm, floor 0.1 mm")
+
+
+def test_a_static_function_is_named_only_where_it_explains_most():
+    given = decision("surrogate_undertrained", reason="network")
+    assert "so the model does not describe this arm" in sentence_of(given, LEVELS, [])
+    text = "a function of the actuation alone explains most of the error, which is 1.25 times"
+    assert text in sentence_of(given, LEVELS, [], static=True)
+    assert text not in sentence_of(given, LEVELS, [])
 
 
 def test_effects_of_a_set_that_leave_different_errors_have_one_each():

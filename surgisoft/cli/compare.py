@@ -226,7 +226,7 @@ def _show(result) -> None:
             print(f"  {each.axis:16s} explains {100 * each.share:3.0f} % of the change")
     for moment in result.worst:
         print(
-            f"  worst: {moment.error_mm:.3f} mm at key point {moment.key_point}, "
+            f"  worst: {moment.error_mm:.3f} mm at key point k{moment.key_point}, "
             f"{moment.recording} t = {moment.t_s:.2f} s"
             + ("" if moment.t_s == moment.along_s else f" ({moment.along_s:.2f} s in the report)")
         )

@@ -486,7 +486,7 @@ def _finish(data: Data, result: FitResult) -> None:
         raise InputError("the fit did not reach a finite error; check the recordings' key points")
     for number, value in enumerate(validation.per_key_point_mm):
         if value is None:
-            result.warnings.append(f"key point {number} is missing in all held-out rows")
+            result.warnings.append(f"key point k{number} is missing in all held-out rows")
     result.model.eval().requires_grad_(False)
     result.known = result.model.residuals_on([train] if valid is None else [train, valid])
     result.model.training_residuals = result.known

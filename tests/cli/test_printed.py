@@ -86,7 +86,7 @@ def test_compare_prints_what_is_known_and_says_what_is_not(bench, capsys, monkey
     assert re.search(r"speed +explains +30 % \(20 .. 40\) beyond actuation", out)
     assert re.search(r"pressure +explains +50 % of the change", out)
     assert "room" not in out, "too small to be shown"
-    assert "worst: 1.500 mm at key point 4, bench t = 3.00 s (1.00 s in the report)" in out
+    assert "worst: 1.500 mm at key point k4, bench t = 3.00 s (1.00 s in the report)" in out
     assert f"next, which effect is missing: surgisoft diagnose default {rec}\n" in out
     two = [comparison("default", coverage=0.9), comparison("other", explainable=0.25)]
     out = printed(capsys, monkeypatch, target, two, "compare", "default", "default", rec)

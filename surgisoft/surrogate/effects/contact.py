@@ -61,13 +61,14 @@ class Contact(Memoryless):
     ):
         """Place a support by the key point that meets it and by its plane.
 
-        point: number of that key point; azimuth_rad: angle of the plane's normal from x; rise_rad:
-        angle of the normal above the base plane; offset_mm: offset of the plane along its normal,
-        base frame.
+        point: number of that key point, from 0 at the base; azimuth_rad: angle of the plane's
+        normal from x; rise_rad: angle of the normal above the base plane; offset_mm: offset of the
+        plane along its normal, base frame.
         """
         super().__init__(facts)
         beam = Beam.through(facts.rest_mm)
-        self.point = int(point) % len(beam.levers)
+        self.last_point = len(beam.levers) - 1
+        self.point = int(point) % (self.last_point + 1)
         self.length_mm = beam.length_mm
         self.share = amplitude(1)
         self.azimuth = nn.Parameter(torch.tensor([float(azimuth_rad)]))
@@ -125,13 +126,14 @@ class Contact(Memoryless):
             Quantity("azimuth_rad", value_of(self.azimuth), "rad", -10.0, 10.0, "any direction"),
             Quantity("rise_rad", value_of(self.rise), "rad", -1.6, 1.6, "any direction"),
             Quantity("offset_mm", offset, "mm", -1.5 * length, 1.5 * length, reach),
-            Quantity("key_point", self.point, "", 0, self.lever.shape[0], "which one meets it"),
+            Quantity("key_point", self.point, "", 0, self.last_point, "which one meets it, from 0"),
         ]
 
     def readings(self, seconds: float | None = None) -> list[Reading]:
         """Place of the support (mm), and how much of the depth it pushes back (%)."""
         normal = ", ".join(f"{part:.2f}" for part in self.normal.detach().tolist())
-        place = f"support of key point {self.point + 1} in direction ({normal}), {{}} from the base"
+        plane = f"a plane with the normal ({normal}), {{}} from the base along the normal"
+        place = f"support of key point k{self.point} by {plane}"
         offset = self.length_mm * float(self.offset.detach())
         share = 100 * float(self.share.detach())
         return [

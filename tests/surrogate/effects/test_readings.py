@@ -182,8 +182,19 @@ def test_lags_say_their_time_constants_and_contact_its_place():
     )
     assert in_words(swing.readings()).startswith("swings at 1.5 Hz, damping ratio 0.25, 100 %")
     wall = with_amplitudes(make_effect("contact", FACTS, point=2, offset_mm=12.0), share=0.5)
-    place = "support of key point 3 in direction (1.00, 0.00, 0.00), 12 mm from the base"
-    assert in_words(wall.readings()) == f"{place}, it pushes 50 % of the depth back"
+    assert in_words(wall.readings()) == (
+        "support of key point k2 by a plane with the normal (1.00, 0.00, 0.00), 12 mm from the "
+        "base along the normal, it pushes 50 % of the depth back"
+    )
+
+
+def test_the_key_point_of_a_contact_is_counted_from_0_as_in_recordings():
+    count = len(FACTS.rest_mm)
+    for given, point in ((0, 0), (-1, count - 1), (count - 2, count - 2)):
+        wall = make_effect("contact", FACTS, point=given)
+        known = {quantity.name: quantity for quantity in wall.quantities()}["key_point"]
+        assert (known.value, known.low, known.high) == (point, 0, count - 1)
+        assert f"key point k{point} " in wall.readings()[0].text
 
 
 def test_a_sentence_leaves_out_what_recordings_do_not_determine():

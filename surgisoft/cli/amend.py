@@ -27,6 +27,7 @@ from surgisoft.cli.options import (
     Refit,
     Replay,
     Report,
+    before_options,
     complete_effects,
     with_effect_files,
 )
@@ -146,7 +147,8 @@ def amend(
     print(result.sentence)
     if saved:
         print(f"wrote {output}: {result.model.summary()}")
-        following = f"surgisoft diagnose {output} {' '.join(map(str, data))}"
+        files = " ".join(map(str, data))
+        following = f"surgisoft diagnose {output} {files}{before_options(before, paired)}"
         print(f"next, find further effects: {with_effect_files(following)}")
     else:
         print(f"{output} was not written; --anyway writes it nevertheless", flush=True)

@@ -27,6 +27,7 @@ from surgisoft.cli.options import (
     Refit,
     Replay,
     Report,
+    before_options,
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
@@ -121,7 +122,8 @@ def improve(
     print(f"wrote {output}: {result.model.summary()}")
     if result.interrupted:
         files = " ".join(map(str, recordings))
-        following = with_effect_files(f"surgisoft improve {output} {files} -o OTHER")
+        again = f"surgisoft improve {output} {files}{before_options(before, paired)} -o OTHER"
+        following = with_effect_files(again)
         print(f"next, to seek further effects: {following}")
         raise typer.Exit(INTERRUPTED)
     known = result.model.fitted_rows

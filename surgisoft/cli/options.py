@@ -59,7 +59,8 @@ Before = Annotated[
         metavar="REC...",
         help="Recordings from before a change. Where they were made with the same actuation, the "
         "difference between the measurements is explained, in which the model's error cancels; "
-        "otherwise the model's residuals before and after are compared.",
+        "otherwise the model's residuals before and after are compared, and effects are fitted as "
+        "without this option.",
     ),
 ]
 Paired = Annotated[
@@ -147,6 +148,15 @@ def with_effect_files(command: str) -> str:
     named = [name for name in named_callables() if name not in command.split()]
     effects = f" --effect-file {' '.join(files)}" if files else ""
     return command + effects + (f" --model-code {' '.join(named)}" if named else "")
+
+
+def before_options(before: list[Path] | None, paired: str) -> str:
+    """The options of a command to run next about recordings from before a change, as this call was
+    given them."""
+    if not before:
+        return ""
+    text = f" --before {' '.join(map(str, before))}"
+    return text if paired == "auto" else f"{text} --paired {paired}"
 
 
 def model_options(predictions: list[Path] | None, error_mm: float | None) -> str:

@@ -310,8 +310,8 @@ def amend(
     the training rows fall and the new layer lowers it in every quarter of them that is left out of
     both fits (`estimation.network`). before: recordings
     from before a change. Where they were made with the same actuation, effects are fitted to the
-    paired difference (`pairs`), so that the network's error does not enter; paired: as for
-    `diagnose`.
+    paired difference (`pairs`), so that the network's error does not enter; otherwise to the
+    model's residuals, as without before (a note says so); paired: as for `diagnose`.
     refit: `always` fits the whole network together with the
     effects, `never` does not, `auto` does where a network may have imitated them
     (`surgisoft.diagnosis.refit`) and the joint fit leaves less on left-out rows than the network
@@ -332,7 +332,7 @@ def amend(
     if before is not None:
         earlier = load_recordings(before)
         both = before_and_after(plain, earlier, paired).with_final_check()
-        notes, table = (*notes, *both.notes), both.table
+        notes, table = (*notes, *both.notes_of_fit), both.table
     problem = table.training()
     names = list(dict.fromkeys(names))
     judged = None

@@ -256,7 +256,9 @@ def improve(
             )
         earlier = load_recordings(before)
         both = before_and_after(table, earlier, paired).with_final_check()
-        notes, problem = (*notes, *both.notes), both.table.training()
+        # Named by the change, which residuals tell without pairs, and fitted to the residuals.
+        notes = (*notes, *dict.fromkeys((*both.notes, *both.notes_of_fit)))
+        problem = both.table.training()
         asked = both.training()
     is_paired = both is not None and both.used
     made, rounds = [_Made(model, known)], []

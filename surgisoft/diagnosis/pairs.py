@@ -176,6 +176,14 @@ class Pairs:
         """(N, n, 3) paired difference: AFTER less BEFORE, mm; NaN where a row has no partner."""
         return self.after_mm - self.before_mm
 
+    def unchanged_mm(self, rows: np.ndarray) -> np.ndarray:
+        """(n,) RMS paired difference of each key point, over rows (N,) bool, if nothing changed, mm.
+
+        The variance of one recording, and that of a mean over k partners: repeatability^2 (1 + 1/k).
+        """
+        partners = self.partners[rows & self.paired]
+        return self.repeatability_mm * np.sqrt(1.0 + np.mean(1.0 / partners))
+
 
 @dataclass(frozen=True)
 class Change:
@@ -200,6 +208,9 @@ class Change:
     """RMS difference of the actuation between partners, as a share of its range."""
     stretches: tuple[Stretch, ...]
     """What was paired with what."""
+    unchanged_mm: float | None = None
+    """RMS paired difference that an arm shows where nothing has changed, mm: a difference of two
+    recordings, to be compared with `change_mm`; None without pairs."""
 
     @property
     def sentence(self) -> str:
@@ -213,8 +224,8 @@ class Change:
         delays = sorted({f"{each.delay_s:z.2f} s" for each in self.stretches[:DELAYS_SHOWN]})
         return (
             f"{100 * self.paired_share:.0f} % of the rows are paired with {names} (delay "
-            f"{', '.join(delays)}); change {self.change_mm:.3g} mm, repeatability "
-            f"{self.repeatability_mm:.3g} mm (from {self.repeatability_source})"
+            f"{', '.join(delays)}); change {self.change_mm:.3g} mm, expected of an unchanged arm "
+            f"{self.unchanged_mm:.3g} mm (from {self.repeatability_source})"
         )
 
     def to_json(self) -> dict:
@@ -982,6 +993,7 @@ class BeforeAfter:
             free_mm=float(np.sqrt(np.mean(pairs.free_mm**2))),
             mismatch=float(np.sqrt(np.average(mismatch**2, weights=counts))),
             stretches=pairs.stretches,
+            unchanged_mm=float(np.sqrt(np.mean(np.square(pairs.unchanged_mm(training))))),
         )
 
     def with_final_check(self) -> "BeforeAfter":
@@ -1014,7 +1026,19 @@ class BeforeAfter:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Limits of the result, in words."""
+        """Limits of a diagnosis or a comparison, in words."""
+        return self._limits("the model's residuals before and after are compared instead")
+
+    @property
+    def notes_of_fit(self) -> tuple[str, ...]:
+        """Limits of effects that were fitted, in words: without pairs to the residuals of AFTER."""
+        return self._limits(
+            "effects are fitted to the model's residuals there and not to the change since then, as "
+            "they would be without --before"
+        )
+
+    def _limits(self, instead: str) -> tuple[str, ...]:
+        """Why rows are not paired, and what is done instead; empty where they are."""
         if self.strange is not None:
             return (self.strange_in_words,)
         if self.used:
@@ -1022,8 +1046,7 @@ class BeforeAfter:
         share = float(self.pairs.paired[~self.table.held_out].mean())
         return (
             f"{100 * share:.0f} % of the rows were recorded with the same actuation as "
-            f"{self.names}: the model's residuals before and after are compared instead; record "
-            "the same protocol before and after",
+            f"{self.names}: {instead}; record the same protocol before and after",
         )
 
 

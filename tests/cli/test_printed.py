@@ -591,6 +591,16 @@ def test_what_is_claimed_is_written_with_its_page(bench, tmp_path, capsys, monke
     assert saved == [new, new]
     assert Path(numbers).read_text().strip() == "{}"
     assert f"{Path(page) / 'report.html'}: default with creep\n" in out
+    assert out.endswith(f"next, find further effects: surgisoft diagnose {new} {rec}\n")
+    again = ["amend", "default", "--effect", "creep", "--data", rec, "-o", new, "--force"]
+    target, after = (
+        "surgisoft.diagnosis.amend.amend",
+        f"surgisoft diagnose {new} {rec} --before {rec}",
+    )
+    out = printed(capsys, monkeypatch, target, found, *again, "--before", rec)
+    assert out.endswith(f"{after}\n")
+    out = printed(capsys, monkeypatch, target, found, *again, "--before", rec, "--paired", "never")
+    assert out.endswith(f"{after} --paired never\n")
 
 
 def test_an_import_names_what_looks_wrong(bench, tmp_path, capsys, monkeypatch):

@@ -130,6 +130,23 @@ def test_repeated_runs_of_before_are_averaged_and_show_its_repeatability(model):
     pooled = np.sqrt(np.square(shifts[1:] - shifts[1:].mean(0)).sum() / 3 + 3 * NOISE_MM**2)
     assert several.repeatability_mm[-1] == pytest.approx(pooled, rel=0.1)
     assert several.repeatability_mm[0] == pytest.approx(np.sqrt(3) * NOISE_MM, rel=0.1)
+    # One recording less the mean of four: 5 / 4 of its variance.
+    every = np.ones(len(several.partners), bool)
+    unchanged = several.unchanged_mm(every)
+    assert unchanged == pytest.approx(np.sqrt(1.25) * several.repeatability_mm)
+
+
+def test_the_change_of_an_unchanged_arm_is_the_one_that_is_printed_beside_it(model):
+    """A second recording of the same motion with the same noise, and nothing else."""
+    motion = smooth_walk(7)
+    before, after = (made(motion, 0.0, seed=seed, name=f"take{seed}") for seed in (0, 1))
+    change = before_and_after(residual_table(model, [after]), [before]).change
+    assert change.repeatability_source == "noise"
+    assert change.unchanged_mm == pytest.approx(np.sqrt(2) * change.repeatability_mm)
+    assert change.change_mm == pytest.approx(change.unchanged_mm, rel=0.05)
+    printed = f"change {change.change_mm:.3g} mm, expected of an unchanged arm "
+    assert f"{printed}{change.unchanged_mm:.3g} mm (from noise)" in change.sentence
+    assert change.to_json()["unchanged_mm"] == change.unchanged_mm
 
 
 def test_noise_of_a_measured_actuation_is_no_change(model):
@@ -239,6 +256,18 @@ def test_no_common_motion_is_a_note_and_an_error_if_pairs_are_asked_for(model):
         diagnose(model, [after], before=[before], paired="always")
     with pytest.raises(InputError, match="pairing"):
         diagnose(model, [after], before=[before], paired="perhaps")
+
+
+def test_an_effect_that_is_fitted_without_pairs_is_said_to_be_fitted_as_without_before(model):
+    after, before = made(smooth_walk(10), 1.0), made(smooth_walk(11), 0.0, seed=2, name="other")
+    settings = {"retune_network": False, "refit": "never"}
+    with_it = amend(model, [after], "payload", before=[before], **settings)
+    without = amend(model, [after], "payload", **settings)
+    assert with_it.parameters == without.parameters
+    assert with_it.held_out == without.held_out
+    (note,) = with_it.notes
+    assert "as other: effects are fitted to the model's residuals there and not to the" in note
+    assert "compared" not in note
 
 
 def lagging(pressure):

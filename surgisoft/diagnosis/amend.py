@@ -31,7 +31,7 @@ from surgisoft.measurement.recordings import load_recordings
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
 from surgisoft.surrogate.effects import named_effect
-from surgisoft.surrogate.fitted_rows import FittedRows
+from surgisoft.surrogate.fitted_rows import FittedRows, Use
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.workers import torch_threads
 
@@ -396,7 +396,8 @@ def amend(
         alone = fall_of(held_out, held_out.with_model(fitted.model), fitted.p_value)
         # The residuals of the fit say nothing of a network that was re-tuned since.
         better.training_residuals = None if retuned else model.training_residuals
-    better.fitted_rows = FittedRows.of([plain.history]).joined(model.fitted_rows)
+    use: Use = "fitted" if retuned or judged is not None else "amended"
+    better.fitted_rows = FittedRows.of([plain.history], use).joined(model.fitted_rows)
     found = Estimates(list(parameters), words)
     parameters, words = beside_former(found, model, problem.covered_s)
     is_paired = both is not None and both.used

@@ -196,7 +196,8 @@ class Comparison:
         """Statement that the error is no test, as the model was fitted to these rows, or empty."""
         if not self.in_fit:
             return ""
-        return f"no test of the model, which was fitted to {self.in_fit:.0%} of these rows"
+        seen = f"which was fitted to or chosen by {self.in_fit:.0%} of these rows"
+        return f"no test of the model, {seen}"
 
     def _depends(self) -> str:
         main = [f"{a.axis} ({100 * a.share:.0f} %)" for a in self.main_axes]

@@ -36,7 +36,7 @@ from surgisoft.files import with_former_keys
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
-from surgisoft.surrogate.fitted_rows import FittedRows
+from surgisoft.surrogate.fitted_rows import FittedRows, Use
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.workers import torch_threads
@@ -359,7 +359,9 @@ def improve(
     if final_model is not model:
         # The residuals of the fit say nothing of a network that was re-tuned since.
         final_model.training_residuals = made[-1].known
-        final_model.fitted_rows = FittedRows.of([table.history]).joined(model.fitted_rows)
+        trained = any(done.together or done.step == NETWORK for done in rounds)
+        use: Use = "fitted" if trained else "amended"
+        final_model.fitted_rows = FittedRows.of([table.history], use).joined(model.fitted_rows)
     opened = sealed.opened(table)
     held_out = whole = opened.final_check()
     if is_paired:

@@ -6,12 +6,13 @@ from pathlib import Path
 import numpy as np
 
 from surgisoft.diagnosis.other_models import notes_of
-from surgisoft.diagnosis.residuals import Problem, Sealed, residual_table
+from surgisoft.diagnosis.residuals import Problem, Sealed, held_out_rows, residual_table
 from surgisoft.diagnosis.weight import under_weight
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import check_fits, history_of, outside_range
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.surrogate.checkpoint import load_model
+from surgisoft.surrogate.fitted_rows import IN_WORDS
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 
@@ -44,22 +45,32 @@ def part_in_fit(model: ArmModel, recordings: list[Recording]) -> tuple[str, ...]
 
     Errors there are errors of the fit and no test of the model.
     """
+    advice = {
+        True: "further effects may be sought there, and only other recordings test the model",
+        False: "use recordings that took no part in the fit",
+    }
     return tuple(
-        f"{recording.name}: the model was fitted to {100 * share:.0f} % of its rows: the error "
-        "there is no test; use recordings that took no part in the fit"
-        for recording, share in zip(recordings, shares_in_fit(model, recordings), strict=True)
-        if share
+        f"{recording.name}: {words}: the error there is no test; "
+        f"{advice[words.startswith(EFFECTS_ALONE)]}"
+        for recording, words in zip(recordings, words_in_fit(model, recordings), strict=True)
+        if words
     )
 
 
-def shares_in_fit(model: ArmModel, recordings: Iterable[Recording]) -> list[float]:
-    """Share 0..1 of the rows of each recording that the model was fitted to.
+EFFECTS_ALONE = IN_WORDS["amended"].partition("{}")[0]
+"""Begin of the words on rows that the network has not seen (`FittedRows.words_of`)."""
 
-    Rows are recognised by their content (`FittedRows`). 0 also where the model keeps no record.
+
+def words_in_fit(model: ArmModel, recordings: Iterable[Recording]) -> list[str]:
+    """What the model has seen of each recording in words, empty for nothing.
+
+    Rows are recognised by their content (`FittedRows`). Empty also where the model keeps no record.
     """
     known = model.fitted_rows
     return [
-        0.0 if known is None else known.part_of(history_of([each], model.spec.actuation))
+        ""
+        if known is None
+        else known.words_of(history_of([each], model.spec.actuation), held_out_rows([each]))
         for each in recordings
     ]
 
@@ -67,12 +78,11 @@ def shares_in_fit(model: ArmModel, recordings: Iterable[Recording]) -> list[floa
 def refuse_rows_of_fit(model: ArmModel, recordings: Iterable[Recording]) -> None:
     """Raise InputError unless the recordings are known to have taken no part in the model's fit."""
     recordings = list(recordings)
-    for recording, share in zip(recordings, shares_in_fit(model, recordings), strict=True):
-        if share:
+    for recording, words in zip(recordings, words_in_fit(model, recordings), strict=True):
+        if words:
             raise InputError(
-                f"{recording.label}: the model was fitted to {100 * share:.0f} % of its rows, "
-                "expected a recording that took no part in the fit; give another one, or leave "
-                "out --test to see the error of the fit"
+                f"{recording.label}: {words}, expected a recording that took no part in the fit; "
+                "give another one, or leave out --test to see the error of the fit"
             )
     if model.fitted_rows is None or not model.fitted_rows.complete:
         raise InputError(

@@ -177,9 +177,9 @@ class Pairs:
         return self.after_mm - self.before_mm
 
     def unchanged_mm(self, rows: np.ndarray) -> np.ndarray:
-        """(n,) RMS paired difference of each key point, over rows (N,) bool, if nothing changed, mm.
+        """(n,) RMS paired difference of a key point, mm, over rows (N,) bool, if nothing changed.
 
-        The variance of one recording, and that of a mean over k partners: repeatability^2 (1 + 1/k).
+        The variance of one recording and that of a mean over k partners: repeatability^2 (1 + 1/k).
         """
         partners = self.partners[rows & self.paired]
         return self.repeatability_mm * np.sqrt(1.0 + np.mean(1.0 / partners))
@@ -1031,10 +1031,10 @@ class BeforeAfter:
 
     @property
     def notes_of_fit(self) -> tuple[str, ...]:
-        """Limits of effects that were fitted, in words: without pairs to the residuals of AFTER."""
+        """Limits of effects that were fitted: without pairs to the residuals of AFTER."""
         return self._limits(
-            "effects are fitted to the model's residuals there and not to the change since then, as "
-            "they would be without --before"
+            "effects are fitted to the model's residuals there and not to the change since then, "
+            "as they would be without --before"
         )
 
     def _limits(self, instead: str) -> tuple[str, ...]:

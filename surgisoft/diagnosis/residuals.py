@@ -517,7 +517,8 @@ class Problem:
         Errors on rows of the fit are no test errors.
         """
         known = self.model.fitted_rows
-        return None if known is None else known.certain_part_of(self.history)
+        held_out = self.table.held_out
+        return None if known is None else known.certain_part_of(self.history, held_out)
 
     @property
     def noise_mm(self) -> np.ndarray:

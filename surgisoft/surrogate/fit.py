@@ -490,7 +490,10 @@ def _finish(data: Data, result: FitResult) -> None:
     result.model.eval().requires_grad_(False)
     result.known = result.model.residuals_on([train] if valid is None else [train, valid])
     result.model.training_residuals = result.known
-    result.model.fitted_rows = FittedRows.of([train] if valid is None else [train, valid])
+    known = FittedRows.of([train])
+    if valid is not None:
+        known = known.joined(FittedRows.of([valid], "chosen"))
+    result.model.fitted_rows = known
 
 
 def _still_chambers(train: History, spec: ArmSpec) -> list[str]:

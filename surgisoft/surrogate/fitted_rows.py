@@ -4,6 +4,9 @@ Every row has a hash of its actuation and key points, rounded to float32; the sk
 of all hashes (bottom-k sketch: Broder 1997). Of other recordings those rows count as known whose
 hash is in the sketch, among all with a hash that is small enough to be in it. So a recording is
 recognised under another name, and when it was cut or joined with others.
+
+Not all rows are used alike: some trained the network, some only chose among its epochs and effects
+and made its interval, and some only fitted effects that were added later. The sketch says which.
 """
 
 from __future__ import annotations
@@ -11,12 +14,21 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from torch import Tensor
 
 from surgisoft.surrogate.history import History
 
+Use = Literal["fitted", "chosen", "amended"]
+"""What rows were used for: training; only choosing the model; only fitting effects to it."""
+IN_WORDS: dict[Use, str] = {
+    "fitted": "the model was fitted to {} of its rows",
+    "chosen": "the model was chosen, not trained, by {} of its rows",
+    "amended": "effects of the model were fitted to {} of its rows",
+}
+"""What a model has seen of a recording; {}: share of its rows."""
 SIZE = 512
 """Most hashes of a sketch. Of 10,000 fitted rows 5 % of the hashes are in it, so that 3,000 other
 rows are judged by some 150 of them."""
@@ -34,12 +46,26 @@ class FittedRows:
     """The least hashes, ascending, at most SIZE; 64 bits each."""
     complete: bool = True
     """Whether these are all rows; not where a model that keeps no record was amended."""
+    chosen: frozenset[int] = frozenset()
+    """Those of the hashes whose rows only chose the model."""
+    amended: frozenset[int] = frozenset()
+    """Those of the hashes to whose rows only effects were fitted, in a model that was amended."""
 
     @classmethod
-    def of(cls, histories: Iterable[History]) -> FittedRows:
-        """The sketch of all rows of histories with a measured key point."""
+    def of(cls, histories: Iterable[History], use: Use = "fitted") -> FittedRows:
+        """The sketch of all rows of histories with a measured key point, used for one thing."""
         found = np.concatenate([row_hashes(history) for history in histories])
-        return cls(len(found), tuple(np.unique(found)[:SIZE].tolist()))
+        hashes = tuple(np.unique(found)[:SIZE].tolist())
+        return cls(len(found), hashes).used(use)
+
+    def used(self, use: Use) -> FittedRows:
+        """The same rows, all in one use."""
+        every, none = frozenset(self.hashes), frozenset[int]()
+        return replace(
+            self,
+            chosen=every if use == "chosen" else none,
+            amended=every if use == "amended" else none,
+        )
 
     def joined(self, other: FittedRows | None) -> FittedRows:
         """The sketch of the rows of both; other: None where its rows are not known."""
@@ -47,32 +73,88 @@ class FittedRows:
             return replace(self, complete=False)
         whole = sorted({*self.hashes, *other.hashes})[:SIZE]
         both = self.complete and other.complete
-        return FittedRows(self.count + other.count, tuple(whole), both)
+        # Rows with several uses count for the one that makes their error smallest.
+        fitted = self._fitted | other._fitted
+        chosen = (self.chosen | other.chosen) - fitted
+        amended = (self.amended | other.amended) - fitted - chosen
+        return FittedRows(
+            self.count + other.count,
+            tuple(whole),
+            both,
+            chosen.intersection(whole),
+            amended.intersection(whole),
+        )
 
-    def share_of(self, history: History, rows: np.ndarray | None = None) -> float:
-        """Estimated share 0..1 of the measured rows of a history that the model was fitted to.
+    @property
+    def _fitted(self) -> frozenset[int]:
+        """The hashes of rows that trained the network."""
+        return frozenset(self.hashes) - self.chosen - self.amended
+
+    def uses_of(
+        self, history: History, rows: np.ndarray | None = None, parts: np.ndarray | None = None
+    ) -> dict[Use, float]:
+        """Estimated share 0..1 of the measured rows of a history in each use.
 
         Equal rows count once: an arm at rest before coarse sensors gives the same row again and
         again, in any recording. rows: (N,) bool, which rows of all runs one after another are asked
-        about.
+        about. parts: (N,) labels of parts that are estimated apart and weighed by their rows, which
+        is exact where the model was fitted to all or none of a part, as by `amend`.
         """
-        found = np.unique(row_hashes(history, rows))
-        if not self.hashes or not len(found):
-            return 0.0
+        if parts is None:
+            return self._uses(np.unique(row_hashes(history, rows)))
+        chosen = np.ones(len(parts), bool) if rows is None else rows
+        asked = [chosen & (parts == part) for part in np.unique(parts)]
+        hashes = [np.unique(row_hashes(history, some)) for some in asked]
+        total = max(sum(map(len, hashes)), 1)
+        answer: dict[Use, float] = {"fitted": 0.0, "chosen": 0.0, "amended": 0.0}
+        for some in hashes:
+            for use, share in self._uses(some).items():
+                answer[use] += share * len(some) / total
+        return answer
+
+    def _uses(self, found: np.ndarray) -> dict[Use, float]:
+        """Estimated share of distinct rows in each use, from their hashes (K,)."""
         if len(self.hashes) == SIZE:
             found = found[found <= self.hashes[-1]]
-        known = np.isin(found, np.array(self.hashes, np.uint64))
-        return float(known.mean()) if len(found) else 0.0
+        kinds: dict[Use, frozenset[int]] = {
+            "fitted": self._fitted,
+            "chosen": self.chosen,
+            "amended": self.amended,
+        }
+        asked, count = set(found.tolist()), max(len(found), 1)
+        return {use: len(asked & known) / count for use, known in kinds.items()}
 
-    def part_of(self, history: History, rows: np.ndarray | None = None) -> float:
+    def share_of(
+        self, history: History, rows: np.ndarray | None = None, parts: np.ndarray | None = None
+    ) -> float:
+        """Estimated share 0..1 of the measured rows of a history that the model was fitted to, in
+        any use; rows, parts: as for `uses_of`."""
+        return min(sum(self.uses_of(history, rows, parts).values()), 1.0)
+
+    def part_of(
+        self, history: History, rows: np.ndarray | None = None, parts: np.ndarray | None = None
+    ) -> float:
         """`share_of`, or 0 where it is less than `LEAST_KNOWN`: the rows took no part."""
-        share = self.share_of(history, rows)
+        share = self.share_of(history, rows, parts)
         return share if share >= LEAST_KNOWN else 0.0
 
-    def certain_part_of(self, history: History) -> float | None:
+    def certain_part_of(self, history: History, parts: np.ndarray | None = None) -> float | None:
         """`part_of`, or None where none of the rows is known but the record is not complete."""
-        share = self.part_of(history)
+        share = self.part_of(history, parts=parts)
         return share if share or self.complete else None
+
+    def words_of(self, history: History, parts: np.ndarray | None = None) -> str:
+        """What the model has seen of a history in words, with shares of its rows; empty for
+        nothing."""
+        shares = self.uses_of(history, parts=parts)
+        if sum(shares.values()) < LEAST_KNOWN:
+            return ""
+        least = min(LEAST_KNOWN, max(shares.values()))
+        return " and ".join(
+            text.format(f"{100 * shares[use]:.0f} %")
+            for use, text in IN_WORDS.items()
+            if shares[use] >= least
+        )
 
     def to_json(self) -> dict:
         """Plain values for a model's `config.json`."""
@@ -80,13 +162,20 @@ class FittedRows:
             "rows": self.count,
             "complete": self.complete,
             "hashes": [f"{value:016x}" for value in self.hashes],
+            "chosen": [f"{value:016x}" for value in sorted(self.chosen)],
+            "amended": [f"{value:016x}" for value in sorted(self.amended)],
         }
 
     @classmethod
     def from_json(cls, values: dict) -> FittedRows:
         """The sketch of a model's `config.json`."""
-        hashes = tuple(int(text, 16) for text in values["hashes"])
-        return cls(int(values["rows"]), hashes, bool(values.get("complete", True)))
+        hashes, chosen, amended = (
+            [int(text, 16) for text in values.get(kind, ())]
+            for kind in ("hashes", "chosen", "amended")
+        )
+        complete = bool(values.get("complete", True))
+        rows = int(values["rows"])
+        return cls(rows, tuple(hashes), complete, frozenset(chosen), frozenset(amended))
 
 
 def row_hashes(history: History, rows: np.ndarray | None = None) -> np.ndarray:

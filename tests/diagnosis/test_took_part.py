@@ -78,7 +78,7 @@ def test_a_test_needs_a_record_of_the_fit(model, known, other):
     with pytest.raises(InputError, match="keeps no record of all rows"):
         compare(amended, [other], test=True)
     assert compare(amended, [other])[0].to_json()["held_out"] is None
-    with pytest.raises(InputError, match="the model was fitted to"):
+    with pytest.raises(InputError, match="effects of the model were fitted to"):
         compare(amended, [known], test=True)
     text = amended.fitted_rows.to_json()
     assert FittedRows.from_json(text) == amended.fitted_rows
@@ -89,7 +89,7 @@ def test_compare_says_what_the_error_is_no_test_of(model, known, other, tmp_path
     new, _ = compare(model, [other], test=True)
     assert seen.in_fit == 1.0
     assert new.in_fit == 0.0
-    assert "no test of the model, which was fitted to 100% of these rows" in seen.sentence
+    assert "which was fitted to or chosen by 100% of these rows" in seen.sentence
     assert "no test" not in new.sentence
     assert seen.to_json()["held_out"] is False
     assert new.to_json()["held_out"] is True

@@ -7,6 +7,7 @@ import pytest
 
 from surgisoft.diagnosis.amend import amend
 from surgisoft.diagnosis.inputs import open_inputs
+from surgisoft.diagnosis.residuals import held_out_rows
 from surgisoft.measurement.fitting import fit
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import make_protocol
@@ -52,6 +53,39 @@ def test_a_sketch_is_small_and_joins_as_the_rows_do(pair):
     assert len(first.hashes) == SIZE < first.count
     assert first.joined(other) == other.joined(first) == both
     assert FittedRows.from_json(both.to_json()) == both
+
+
+def test_rows_that_only_chose_the_model_are_not_called_fitted(pair):
+    """Training rows in the one, held-out ones in the other, some in both."""
+    known = fit(pair[0], valid=pair[1], effects=[], hidden=(8,), epochs=1).model
+    notes = " ".join(open_inputs(known, list(pair))[2])
+    assert "the model was fitted to 100 % of its rows: the error there is no test; use" in notes
+    assert "the model was chosen, not trained, by 100 % of its rows: the error there is n" in notes
+    first, other = (history_of([each]) for each in pair)
+    trained, chose = FittedRows.of([first]), FittedRows.of([first, other], "chosen")
+    assert chose.uses_of(other) == {"fitted": 0.0, "chosen": 1.0, "amended": 0.0}
+    for both in (trained.joined(chose), chose.joined(trained)):
+        assert both.uses_of(first) == {"fitted": 1.0, "chosen": 0.0, "amended": 0.0}
+        assert both.uses_of(other)["chosen"] == 1.0
+        assert FittedRows.from_json(both.to_json()) == both
+    values = trained.to_json()
+    del values["chosen"], values["amended"]
+    assert FittedRows.from_json(values) == trained
+
+
+def test_the_rows_that_effects_were_fitted_to_are_counted_as_they_are(pair, model):
+    """`amend` fits to the rows that are not held out, and to all of them: no estimate is needed."""
+    fresh = amend(model, [pair[1]], "gain_mismatch", False, refit="never").model
+    share = 1.0 - held_out_rows([pair[1]]).mean()
+    (note,) = (text for text in open_inputs(fresh, [pair[1]])[2] if "of its rows" in text)
+    assert f"effects of the model were fitted to {100 * share:.0f} % of its rows: the err" in note
+    assert note.endswith(
+        "further effects may be sought there, and only other recordings test the model"
+    )
+    history, parts = history_of([pair[1]]), held_out_rows([pair[1]])
+    exact = fresh.fitted_rows.uses_of(history, parts=parts)
+    assert exact == pytest.approx({"fitted": 0.0, "chosen": 0.0, "amended": share}, abs=1e-12)
+    assert fresh.fitted_rows.share_of(history) != pytest.approx(share, abs=1e-6)
 
 
 def test_a_model_keeps_what_it_was_fitted_to_and_notes_report_it(pair, model, tmp_path):

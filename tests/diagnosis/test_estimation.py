@@ -412,6 +412,16 @@ def test_a_value_of_which_nothing_is_learned_is_said_to_be_not_identifiable(low,
     assert chambers.identifiable
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "known"),
+    [(3.6e-5, 3.3e7, False), (0.009, 1e4, False), (0.011, 3.3e7, True), (3.6e-5, 9e3, True)],
+)
+def test_a_range_from_zero_is_covered_by_an_interval_of_a_logarithm(low, high, known):
+    """The stress above which a fluid is shear-thinning is positive, as small as it may be."""
+    turn = Parameter("rate_dependence", "turn", 226.7, low, high, "", True, (0.0, 1e4), "wide")
+    assert turn.identifiable is known
+
+
 def test_a_page_has_words_and_former_values_of_parameters():
     """The column of former values is there where the model had an effect of them."""
     fresh = Parameter("creep", "tau_s", 90.0, 80.0, 95.0, "s", True, (0.1, 2000.0), "the library's")

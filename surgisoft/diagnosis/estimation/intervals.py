@@ -42,6 +42,9 @@ from surgisoft.surrogate.model import ArmModel
 
 DRAWS = 400
 """Draws of the values."""
+NEGLIGIBLE = 1e-6
+"""Share of the largest plausible value that counts as zero: a value that is fitted by its logarithm
+reaches no zero, where its plausible range may begin."""
 MOST_VALUES = 9
 """Most values of one quantity that are written out."""
 
@@ -88,9 +91,10 @@ class Parameter:
 
         They do not where the 95 % interval covers that range for every value: practical
         non-identifiability (Raue et al. 2009), such as of a time constant of hours in a recording
-        of minutes.
+        of minutes. A range that begins at zero is covered from NEGLIGIBLE of its end on.
         """
         least, most = self.plausible_range
+        least = NEGLIGIBLE * most if least == 0.0 else least
         low, high = np.asarray(self.low, float), np.asarray(self.high, float)
         return not bool(np.all((low <= least) & (high >= most)))
 

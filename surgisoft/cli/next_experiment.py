@@ -27,6 +27,8 @@ from surgisoft.files import write_atomically, write_json
 
 ON_RIG = (3, "kPa")
 """Number of chambers and unit of the arm on the virtual rig."""
+VIRTUAL = "virtual"
+"""The rig that is meant where none is named."""
 SHOWN_PAIRS = 10
 """Pairs of effects that are always printed (a count); a chance below `SURE` is always printed."""
 
@@ -66,7 +68,7 @@ def next_experiment(
             help="Run the schedule on the rig at once and write this recording.",
         ),
     ] = None,
-    rig: RigOption = "virtual",
+    rig: RigOption = VIRTUAL,
     json_file: JsonFile = None,
     effect_files: EffectFiles = None,
     force: Force = False,
@@ -131,16 +133,22 @@ def _show(
     print(f"why: {result.why}")
     for number, step in enumerate(result.steps, 1):
         print(f"  {number}. {step}")
-    new, other = record or Path("NEW.parquet"), rig.partition(":")[0] != "virtual"
+    new, other = record or Path("NEW.parquet"), rig.partition(":")[0] != VIRTUAL
+    named = rig != VIRTUAL or record is not None
+    if not named:
+        print(
+            f"  on a bench of your own: play {output} run by run, the actuation linear in time "
+            "between its rows"
+        )
     if other and not record:
         print(f"  on the rig: surgisoft collect {output} --rig {rig} -o {new}")
     elif not other and (result.protocol.commands.shape[1], result.protocol.unit) == ON_RIG:
         options = f" {result.options}" if result.options else ""
-        place = "" if rig == "virtual" else f" --rig {rig}"
+        place = "" if rig == VIRTUAL else f" --rig {rig}"
         if result.by_hand:
-            print(
-                "  the virtual rig has no option for that change: --as-it-stands proposes no change"
-            )
+            if named:
+                print("  the virtual rig has no option for that change")
+            print("  --as-it-stands proposes an experiment without a change of the bench")
         elif not record:
             print(f"  on the virtual rig: surgisoft collect {output}{place}{options} -o {new}")
     # After a change that removes an effect, only the new recording counts.

@@ -565,7 +565,8 @@ def test_what_is_claimed_is_written_with_its_page(bench, tmp_path, capsys, monke
     monkeypatch.setattr(f"{pages}.amend_page", lambda made, title, about: title)
     monkeypatch.setattr("surgisoft.report.write_page", lambda page, file: f"{file}: {page}")
     monkeypatch.setattr(
-        f"{pages}.write_improve_report", lambda made, tables, folder, title: [f"{folder}: {title}"]
+        f"{pages}.write_improve_report",
+        lambda made, tables, folder, title, command: [f"{folder}: {title}: {command}"],
     )
     rec, new, page = str(bench / "bench.parquet"), str(tmp_path / "new"), str(tmp_path / "page")
     numbers, replay = str(tmp_path / "n.json"), str(tmp_path / "r.rrd")
@@ -573,13 +574,18 @@ def test_what_is_claimed_is_written_with_its_page(bench, tmp_path, capsys, monke
     found = result(
         claimed=True, rounds=[], steps=[], parameters=[], effects=("creep",), refitted=(),
         in_words={}, retuned=False, refit=None, sentence="the error falls",
+        diagnoses=[
+            SimpleNamespace(
+                next_command="next", command=lambda *names: f"diagnose {' '.join(names).strip()}"
+            )
+        ],
         model=SimpleNamespace(summary=lambda: "an arm", fitted_rows=None),
     )  # fmt: skip
     out = printed(
         capsys, monkeypatch, "surgisoft.diagnosis.improve.improve", found,
         "improve", "default", rec, *options,
     )  # fmt: skip
-    assert "What default lacks on bench" in out
+    assert f"What default lacks on bench: diagnose {new} {rec}\n" in out
     assert "the error falls\n" in out
     assert f"wrote {new}: an arm\nnext, both models on an unseen recording: surg" in out
     assert saved == [new]
@@ -659,7 +665,7 @@ def test_an_experiment_that_takes_something_away_is_told_by_hand(
     for by_hand, said in (
         (
             True,
-            "  the virtual rig has no option for that change: --as-it-stands proposes no change\n",
+            "  --as-it-stands proposes an experiment without a change of the bench\n",
         ),
         (False, f"  on the virtual rig: surgisoft collect {new} --payload 5 -o NEW.parquet\n"),
     ):
@@ -669,6 +675,16 @@ def test_an_experiment_that_takes_something_away_is_told_by_hand(
         )  # fmt: skip
         Path(new).unlink()
         assert said in out
+        assert "the virtual rig has no option" not in out, "no rig is in use"
+        linear = f"  on a bench of your own: play {new} run by run, the actuation linear in time "
+        assert f"{linear}between its rows\n" in out
+        rig = ["--rig", "virtual:seed=3"]
+        known = printed(
+            capsys, monkeypatch, target, plan, "next-experiment", model, rec, "-o", new, *rig
+        )  # fmt: skip
+        Path(new).unlink()
+        assert ("the virtual rig has no option for that change\n" in known) is by_hand
+        assert "bench of your own" not in known
         assert (f" {rec} NEW.parquet" in out) is not by_hand
         assert ("--without payload" in out) is by_hand
         assert "creep or payload: expected chance of the right one 0.50 -> 0.90" in out

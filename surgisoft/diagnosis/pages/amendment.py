@@ -201,11 +201,13 @@ def improve_page(
     about: str,
     measured: ResidualTable | None = None,
     drawn: Path | None = None,
+    command: str = "",
 ) -> Page:
     """The page of an improvement, which tells a colleague the whole story.
 
     measured: residuals of the given model, from which the page says what was measured. drawn: a
-    picture of the bodies before and after.
+    picture of the bodies before and after. command: what to run next, with the names of the files;
+    default: with words for them.
     """
     fall = result.held_out
     facts = Facts(
@@ -246,18 +248,22 @@ def improve_page(
     if result.parameters:
         parts.append(Section("Parameters", parameter_parts(result)))
     if result.diagnoses:
-        parts.append(what_is_left(result))
+        parts.append(what_is_left(result, command))
     parts.append(Section("How to read this", how_to_read(fall)))
     tone = "good" if result.claimed else "warn"
     return Page(title=title, verdict=result.sentence, about=about, tone=tone, parts=parts)
 
 
 def write_improve_report(
-    result: Improvement, tables: dict[str, ResidualTable], folder: Path, title: str
+    result: Improvement,
+    tables: dict[str, ResidualTable],
+    folder: Path,
+    title: str,
+    command: str = "",
 ) -> list[Path]:
     """Write the report of an improvement to a folder; returns its files, the page first.
 
-    tables: residuals `before` and `after`, on the same recordings.
+    tables: residuals `before` and `after`, on the same recordings. command: as for the page.
     """
     folder.mkdir(parents=True, exist_ok=True)
     drawn = []
@@ -269,7 +275,7 @@ def write_improve_report(
         figure = bodies(shown if result.steps else {"before": shown["before"]}, where)
         drawn.append(save(figure, folder / "bodies.png"))
     picture = drawn[0] if drawn else None
-    page = improve_page(result, title, result.model.summary(), before, picture)
+    page = improve_page(result, title, result.model.summary(), before, picture, command)
     files = [write_page(page, folder / "report.html"), *drawn]
     if result.steps:
         fall, path = result.held_out, folder / "waterfall.png"
@@ -341,10 +347,15 @@ def _missing(result: Improvement) -> Section:
 def _ranking_words(first: Diagnosis, added: Sequence[str]) -> str:
     """The first few of the ranking in a sentence."""
     best, *others = first.ranking
-    text = (
-        f"By itself, {best.effect} leaves {best.heldout_rmse_mm:.3f} mm of "
-        f"{first.error_mm.before:.3f} mm on held-out blocks"
-    )
+    alone = first.error_mm.discrepancy_alone
+    text = f"By itself, {best.effect} leaves {best.heldout_rmse_mm:.3f} mm on held-out blocks"
+    if alone is not None:
+        text += (
+            f", where the model discrepancy alone, without an effect, leaves {alone:.3f} mm of the "
+            f"model's {first.error_mm.before:.3f} mm; what it explains alone is the share that "
+            f"goes of the squared error between {alone:.3f} mm and the noise floor of "
+            f"{first.error_mm.floor:.3f} mm"
+        )
     if others:
         least = min(others, key=lambda each: each.heldout_rmse_mm)
         text += f"; of the others, {least.effect} leaves least, {least.heldout_rmse_mm:.3f} mm"
@@ -374,8 +385,8 @@ def _worth(result: Improvement) -> str:
     )
 
 
-def what_is_left(result: Improvement) -> Section:
-    """What is left after the last round, and what to record next."""
+def what_is_left(result: Improvement, command: str = "") -> Section:
+    """What is left after the last round, and what to record next; command: as for the page."""
     last = result.diagnoses[-1]
     parts: list[Part] = [Text(last_word(result))]
     if result.interrupted:  # the last diagnosis may be that of an earlier model
@@ -396,7 +407,7 @@ def what_is_left(result: Improvement) -> Section:
         text = f"Record next: {plan.name}, {plan.minutes:g} minutes; it distinguishes {pairs}."
         parts.append(Text(text))
     if last.next_command and not (result.steps and "amend" in last.next_command):
-        parts.append(Command(last.command("NEW", "REC")))
+        parts.append(Command(command or last.command("NEW", "REC")))
     if last.not_testable:
         rows = [(each.effect, each.reason) for each in last.not_testable]
         text = (

@@ -455,7 +455,9 @@ def since(result: Diagnosis, both: BeforeAfter, found: Findings) -> Diagnosis:
     text = f"since {both.names}: {verdict.sentence}; {both.change.sentence}"
     track = None
     if both.used:
-        track = both.track(found.problem, found.explained_mm(verdict.effects))
+        # Effects that cannot be told apart are alternatives, which do not act at once.
+        acting = verdict.effects[:1] if verdict.kind == "ambiguous" else verdict.effects
+        track = both.track(found.problem, found.explained_mm(acting))
     return replace(result, change=both.change, track=track, verdict=replace(verdict, sentence=text))
 
 

@@ -246,7 +246,8 @@ class ChangeTrack:
     after_mm: np.ndarray
     """(S, n, 3) key points of AFTER, base frame, mm; NaN where missing."""
     explained_mm: np.ndarray
-    """(S, n, 3) change that the named effects explain, mm; 0 where none is named."""
+    """(S, n, 3) change that the named effects explain, of alternatives the first alone, mm; 0 where
+    none is named."""
 
     @property
     def change_mm(self) -> np.ndarray:

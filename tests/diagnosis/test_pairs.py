@@ -3,6 +3,7 @@
 import copy
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,13 +11,15 @@ import torch
 
 from surgisoft.cli import run
 from surgisoft.diagnosis.amend import amend
-from surgisoft.diagnosis.diagnose import diagnose
+from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Verdict, diagnose, since
 from surgisoft.diagnosis.known_error import known_error
+from surgisoft.diagnosis.pages import diagnosis as page
 from surgisoft.diagnosis.pairs import before_and_after
 from surgisoft.diagnosis.residuals import residual_table
 from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import Recording, load_recording, save_recording
+from surgisoft.report import charts
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, save_model
 from surgisoft.surrogate.model import Validation
@@ -238,10 +241,52 @@ def test_payload_is_named_behind_a_wrong_network(rig_takes):
     assert found.track.explained_mm.shape == found.track.change_mm.shape
     left = found.track.change_mm - found.track.explained_mm
     assert np.nanstd(left) < 0.6 * np.nanstd(found.track.change_mm)
+    assert drawn(found) == (
+        ["noise floor", "no effect (discrepancy alone)", "size of the change"],
+        "change explained by payload",
+    )
+    either = replace(found.verdict, kind="ambiguous", effects=("payload", "misalignment"))
+    label = "change explained by payload alone (or else by misalignment)"
+    assert drawn(replace(found, verdict=either))[1] == label
+    plain = replace(found, track=None)
+    assert drawn(plain)[0][-1] == "error of the model"
     result = amend(model, [after], "payload", before=[before], retune_network=False)
     assert result.claimed
     assert result.held_out.after < 0.6 * result.held_out.before
     assert result.model_error.before > 1.5 * result.held_out.before
+
+
+def drawn(found) -> tuple[list[str], str]:
+    """Labels of the lines in the chart of the effects, and of what is explained of the change."""
+    figures = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(charts, "chart", lambda figure, *_: figures.append(figure))
+        page._chart(found)
+        if found.track is not None:
+            page._change_chart(found.track, page.explained_by(found))
+    marks = {
+        line.get_label(): line.get_xdata()[0]
+        for line in figures[0].axes[0].lines
+        if not line.get_label().startswith("_")
+    }
+    assert list(marks.values()) == [
+        found.error_mm.floor, found.error_mm.discrepancy_alone, found.error_mm.before,
+    ]  # fmt: skip
+    return list(marks), figures[-1].axes[-1].lines[-1].get_label()
+
+
+def test_alternatives_are_not_drawn_as_if_they_acted_at_once():
+    """The explained change of an ambiguous result is that of its first effect alone."""
+    asked = []
+    both = SimpleNamespace(
+        names="before", used=True, change=SimpleNamespace(sentence="it changed"),
+        track=lambda problem, explained: explained,
+    )  # fmt: skip
+    found = SimpleNamespace(problem=None, explained_mm=lambda effects: asked.append(effects))
+    for kind in ("ambiguous", "several"):
+        verdict = Verdict(kind, ("payload", "misalignment"), "")
+        since(Diagnosis(verdict, ErrorLevels(1.0, 0.1, 0.2), ()), both, found)
+    assert asked == [("payload",), ("payload", "misalignment")]
 
 
 # Inputs --------------------------------------------------------------------------------------

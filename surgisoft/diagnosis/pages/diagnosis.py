@@ -10,6 +10,7 @@ from surgisoft.diagnosis.pairs import ChangeTrack
 from surgisoft.diagnosis.refit import Refit
 from surgisoft.diagnosis.setup import SetupFault, SetupResult
 from surgisoft.report import Command, Facts, Page, Part, Section, Share, Table, Text, write_page
+from surgisoft.report.style import MUTED
 
 HOW = (
     "Every effect is added to the model with each choice of its nonlinear parameters, to first "
@@ -17,7 +18,8 @@ HOW = (
     "for the model discrepancy and has the size of the model's validated error. Effects are "
     "compared by the error on held-out blocks of time.\n\n"
     "Alone: the share of what can be explained of the held-out squared error (what lies above the "
-    "noise floor) that this effect removes by itself. Unique: the share that returns when it is "
+    "noise floor and below the dash-dotted line of the chart, the error that the model discrepancy "
+    "leaves alone) that this effect removes by itself. Unique: the share that returns when it is "
     "left out of all effects together. Of collinear effects, which predict nearly the same change, "
     "the first is large and the second small.\n\n"
     "P-value: how often random signs of the blocks' gains give so large a gain in any of the "
@@ -65,7 +67,7 @@ def diagnosis_page(found: Diagnosis, title: str, command: str = "") -> Page:
     """
     error, verdict = found.error_mm, found.verdict
     facts = [
-        ("error", f"{error.before:.3f} mm"),
+        ("error" if found.track is None else "change", f"{error.before:.3f} mm"),
         ("noise floor", f"{error.floor:.3f} mm"),
         ("best achievable error", f"{error.best_achievable:.3f} mm"),
         ("time", f"{found.seconds:.1f} s"),
@@ -148,19 +150,29 @@ def _change(found: Diagnosis) -> Section:
         header = ["after", "before", "delay [s]", "rows", "difference of the actuation"]
         parts.append(Table(header, rows))
     if found.track is not None:
-        parts += [_change_chart(found.track, found.verdict.effects), Text(HOW_CHANGE)]
+        parts += [_change_chart(found.track, explained_by(found)), Text(HOW_CHANGE)]
     return Section("Before and after", parts)
 
 
-def _change_chart(track: ChangeTrack, effects: tuple[str, ...]):
-    """The tip before and after, and its change, along the stretch in which it changes most."""
+def explained_by(found: Diagnosis) -> str:
+    """What the explained change of a diagnosis is explained by, in words."""
+    effects = found.verdict.effects
+    if found.verdict.kind == "ambiguous":
+        return f"{effects[0]} alone (or else by {' or '.join(effects[1:])})"
+    return " + ".join(effects) if effects else "the named effects (none)"
+
+
+def _change_chart(track: ChangeTrack, name: str):
+    """The tip before and after, and its change, along the stretch in which it changes most.
+
+    name: what the explained change is explained by.
+    """
     from surgisoft.report.charts import AMBER, BLUE, GREEN, RED, chart, drawing, plt
 
     rows = worst_stretch(track)
     change = track.change_mm[rows, -1]
     along = np.linalg.svd(np.nan_to_num(change), full_matrices=False)[2][0]
     time = track.t_s[rows]
-    name = " + ".join(effects) if effects else "the named effects (none)"
     with drawing():
         figure, (top, below) = plt.subplots(2, 1, figsize=(7.2, 4.6), sharex=True)
         rest = np.nanmean(track.before_mm[:, -1], axis=0)
@@ -316,10 +328,12 @@ def _number(value) -> str:
 
 
 def _chart(found: Diagnosis):
-    """Held-out error with each effect, between the error before and the noise floor."""
+    """Held-out error with each effect, between the noise floor and what is left without any."""
     from surgisoft.report.charts import AMBER, BLUE, GREEN, RED, chart, drawing, plt
 
     rows = found.shown[::-1]
+    error, paired = found.error_mm, found.track is not None
+    what, blocks = "change" if paired else "error", "left-out" if found.in_fit else "held-out"
     with drawing():
         figure, axis = plt.subplots(figsize=(4.8, 0.6 + 0.24 * max(len(rows), 3)))
         for place, row in enumerate(rows):
@@ -327,13 +341,18 @@ def _chart(found: Diagnosis):
             low, high = row.ci95
             axis.plot([low, high], [place, place], c=RED if named else BLUE, lw=1.2, alpha=0.6)
             axis.plot(row.heldout_rmse_mm, place, "o", c=RED if named else BLUE, ms=5)
-        axis.axvline(found.error_mm.floor, c=GREEN, lw=1, label="noise floor")
-        axis.axvline(found.error_mm.before, c=AMBER, lw=1, ls="--", label="error of the model")
+        axis.axvline(error.floor, c=GREEN, lw=1, label="noise floor")
+        if error.discrepancy_alone is not None:
+            label = "no effect (discrepancy alone)"
+            axis.axvline(error.discrepancy_alone, c=MUTED, lw=1, ls="-.", label=label)
+        label = "size of the change" if paired else "error of the model"
+        axis.axvline(error.before, c=AMBER, lw=1, ls="--", label=label)
         axis.set_yticks(range(len(rows)), [row.effect for row in rows])
-        axis.set_xlabel("held-out error with this effect added [mm]")
+        left = "change left" if paired else "error"
+        axis.set_xlabel(f"{blocks} {left} with this effect added [mm]")
         axis.set_xlim(left=0)
-        axis.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
-        return chart(figure, "Held-out error with each effect")
+        figure.legend(fontsize=8, loc="outside upper center", ncols=2)
+        return chart(figure, f"{blocks.capitalize()} {what} with each effect")
 
 
 def write_report(found: Diagnosis, folder: Path, title: str, command: str = "") -> Path:

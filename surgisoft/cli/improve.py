@@ -112,9 +112,9 @@ def improve(
         title = f"What {model.name} lacks on {names}"
         # The model that the last diagnosis is of, if it is written.
         last = output if result.claimed else model
-        files = (" ".join(map(str, given)) for given in (recordings, before or ()))
+        given = (" ".join(map(str, some)) for some in (recordings, before or ()))
         found = result.diagnoses[-1]
-        command = with_effect_files(found.command(str(last), *files)) if found.next_command else ""
+        command = with_effect_files(found.command(str(last), *given)) if found.next_command else ""
         written += write_improve_report(result, tables, report, title, command)
     if replay:
         written.append(write_before_and_after(result, tables, model.name, replay))

@@ -27,7 +27,7 @@ from surgisoft.diagnosis.estimation.least_squares import (
     repeated_scan,
     vector,
 )
-from surgisoft.diagnosis.estimation.network import _tuned, retune
+from surgisoft.diagnosis.estimation.network import best_layer, retune
 from surgisoft.diagnosis.estimation.network_error import NetworkError
 from surgisoft.diagnosis.estimation.nuisance import Nuisance, kinds
 from surgisoft.diagnosis.pages.amendment import parameter_parts
@@ -268,7 +268,7 @@ def test_a_layer_that_makes_a_left_out_quarter_worse_is_not_kept():
     points = recording.key_points_mm.copy()
     points[: int(0.45 * len(points)), 1:, 0] += 1.0
     moved = problem_of(arm, [replace(recording, key_points_mm=points)], part="training")
-    assert _tuned(arm, moved).kept
+    assert best_layer(arm, moved).kept
     found = retune(arm, moved)
     assert not found.kept
     assert found.model is arm

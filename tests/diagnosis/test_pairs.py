@@ -261,9 +261,9 @@ def drawn(found) -> tuple[list[str], str]:
     figures = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(charts, "chart", lambda figure, *_: figures.append(figure))
-        page._chart(found)
+        page.effects_chart(found)
         if found.track is not None:
-            page._change_chart(found.track, page.explained_by(found))
+            page.change_chart(found.track, page.explained_by(found))
     marks = {
         line.get_label(): line.get_xdata()[0]
         for line in figures[0].axes[0].lines

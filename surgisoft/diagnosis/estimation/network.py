@@ -68,7 +68,7 @@ def retune(model: ArmModel, problem: Problem, effects: Iterable[str] = ()) -> Re
     if not isinstance(model.network, HawNN):
         return Retuned(model, False, 0.0)
     problem = problem.with_model(model)
-    tuned = _tuned(model, problem)
+    tuned = best_layer(model, problem)
     if not tuned.kept:
         return tuned
     before = after = 0.0
@@ -92,7 +92,7 @@ def _quarters(problem: Problem) -> Iterator[np.ndarray]:
 def _fitted_without(inside: Problem, effects: tuple[str, ...]) -> tuple[ArmModel, ArmModel]:
     """The models without and with a new layer that the rows of a problem lead to."""
     alone = fit_effects(inside, list(effects)).model if effects else inside.model
-    return alone, _tuned(alone, inside.with_model(alone)).model
+    return alone, best_layer(alone, inside.with_model(alone)).model
 
 
 def _squares(problem: Problem) -> np.ndarray:
@@ -107,7 +107,7 @@ def _falls(before: np.ndarray, after: np.ndarray) -> bool:
 
 
 @torch.no_grad()
-def _tuned(model: ArmModel, problem: Problem) -> Retuned:
+def best_layer(model: ArmModel, problem: Problem) -> Retuned:
     """The layer that fits a problem best, kept where motion that is held out in turn rewards it.
 
     problem: with the residuals of the model.

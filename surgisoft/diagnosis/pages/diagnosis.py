@@ -83,7 +83,7 @@ def diagnosis_page(found: Diagnosis, title: str, command: str = "") -> Page:
         parts.append(_setup(found.setup))
     else:
         if found.ranking:
-            parts.append(Section("Effects", [_chart(found), _ranking(found)]))
+            parts.append(Section("Effects", [effects_chart(found), _ranking(found)]))
         if found.not_testable:
             rows = [(each.effect, each.reason) for each in found.not_testable]
             note = Text("These recordings cannot show these effects, so they are not ranked.")
@@ -150,7 +150,7 @@ def _change(found: Diagnosis) -> Section:
         header = ["after", "before", "delay [s]", "rows", "difference of the actuation"]
         parts.append(Table(header, rows))
     if found.track is not None:
-        parts += [_change_chart(found.track, explained_by(found)), Text(HOW_CHANGE)]
+        parts += [change_chart(found.track, explained_by(found)), Text(HOW_CHANGE)]
     return Section("Before and after", parts)
 
 
@@ -162,7 +162,7 @@ def explained_by(found: Diagnosis) -> str:
     return " + ".join(effects) if effects else "the named effects (none)"
 
 
-def _change_chart(track: ChangeTrack, name: str):
+def change_chart(track: ChangeTrack, name: str):
     """The tip before and after, and its change, along the stretch in which it changes most.
 
     name: what the explained change is explained by.
@@ -327,7 +327,7 @@ def _number(value) -> str:
     return f"{value:.4g}"
 
 
-def _chart(found: Diagnosis):
+def effects_chart(found: Diagnosis):
     """Held-out error with each effect, between the noise floor and what is left without any."""
     from surgisoft.report.charts import AMBER, BLUE, GREEN, RED, chart, drawing, plt
 

@@ -34,6 +34,7 @@ from surgisoft.diagnosis.data_quality import (
 from surgisoft.diagnosis.decision import (
     CLEAR_JUMPS,
     CLEAR_SHIFT,
+    LEAST_EXPLAINED,
     MOSTLY_STATIC,
     Decision,
     Kind,
@@ -597,7 +598,8 @@ def result_of(found: Findings, decision: Decision | None = None) -> Diagnosis:
     )
     ranking = tuple(_ranked(found, score, decision) for score in _order(found, decision))
     static = evidence.free_static >= MOSTLY_STATIC * evidence.free_box
-    sentence = sentence_of(decision, levels, _reached(found, effects, kind), where, static)
+    near, reached = nearest(ranking), _reached(found, effects, kind)
+    sentence = sentence_of(decision, levels, reached, where, static, near)
     others = _instead(evidence) if kind == "several" else ()
     if others:
         sentence += (
@@ -803,16 +805,24 @@ def _share(value: float) -> float:
     return float(min(max(value, 0.0), 1.0))
 
 
+def nearest(ranking: Sequence[Ranked]) -> str | None:
+    """The effect that alone explains most; None where that is next to nothing."""
+    best = max(ranking, key=lambda row: row.gain_alone, default=None)
+    return best.effect if best is not None and best.gain_alone >= LEAST_EXPLAINED else None
+
+
 def sentence_of(
     decision: Decision,
     levels: ErrorLevels,
     reached: Sequence[float],
     where: str = HELD_OUT,
     static: bool = False,
+    near: str | None = None,
 ) -> str:
     """The verdict in words. reached: error with the named effects, or with each of a set, on blocks
     that these were not fitted to, mm; where: these blocks in words; static: whether a function of
-    the actuation alone explains most of what can be explained."""
+    the actuation alone explains most of what can be explained; near: the effect that comes nearest
+    to an unknown one."""
     kind, effects, sure = decision.kind, decision.effects, decision.confidence
     error = f"error {levels.before:.3g} mm, floor {levels.floor:.3g} mm"
     if kind == "identified":
@@ -836,7 +846,6 @@ def sentence_of(
             f"that it is one of them): {each} on {where}; {error}"
         )
     if kind == "unknown_effect":
-        near = next(iter(decision.probabilities.effects), None)
         return (
             f"the missing effect is none of the known ones (confidence {sure:.2f}; "
             f"{f'nearest: {near}' if near else 'none is near'}); {error}"

@@ -20,7 +20,9 @@ from surgisoft.diagnosis.decision import (
 from surgisoft.diagnosis.design.schedules import SETUPS
 from surgisoft.diagnosis.diagnose import (
     ErrorLevels,
+    Ranked,
     effect_left,
+    nearest,
     next_command,
     periodic,
     sentence_of,
@@ -148,9 +150,7 @@ def decision(kind, *effects, reason=None, chances=CHANCES, statements=()) -> Dec
          "surgisoft amend {model} --effect creep drift --data {data}{before} -o NEW"),
         (decision("ambiguous", "creep", "drift"), "cannot tell creep from drift with these record",
          "surgisoft next-experiment {model} {data} --between creep drift -o SCHEDULE.csv"),
-        (decision("unknown_effect"), "none of the known ones (confidence 0.75; nearest: creep",
-         ""),
-        (decision("unknown_effect", chances=NONE), "(confidence 0.75; none is near)", ""),
+        (decision("unknown_effect"), "none of the known ones (confidence 0.75; none is near)", ""),
         (decision("surrogate_undertrained"), "and most probably it is the network's own; it needs",
          "surgisoft fit {data} -o NEW"),
         (decision("surrogate_undertrained", reason="network"), "the model does not describe this a",
@@ -171,6 +171,19 @@ def decision(kind, *effects, reason=None, chances=CHANCES, statements=()) -> Dec
 def test_each_kind_of_result_has_its_sentence_and_its_next_command(given, sentence, command):
     assert sentence in sentence_of(given, LEVELS, [0.15])
     assert next_command(given) == command
+
+
+def test_the_effect_nearest_to_an_unknown_one_is_that_which_alone_explains_most():
+    """The ranking has the more probable one first. Less than 5 % is next to nothing."""
+    rows = [
+        Ranked(name, 0.1, gain, 0.0, 1.0, (0.9, 1.1), 0.5, 0.0, {})
+        for name, gain in (("creep", 0.002), ("drift", 0.15), ("twist", 0.04))
+    ]
+    assert nearest(rows) == "drift"
+    assert nearest(rows[::2]) is None
+    assert nearest([]) is None
+    text = sentence_of(decision("unknown_effect"), LEVELS, [], near="drift")
+    assert "(confidence 0.75; nearest: drift)" in text
 
 
 @pytest.mark.parametrize("reason", [None, "network", "learned"])

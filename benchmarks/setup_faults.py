@@ -154,6 +154,11 @@ def _late(recording: Recording, rng: np.random.Generator) -> Recording:
     return replace(recording, temp_C=None, payload_g=None, **({"commanded": None} | fresh))
 
 
+def _time_unit(recording: Recording, rng: np.random.Generator) -> Recording:
+    """Times in ms where s are stated, or in s where ms are."""
+    return replace(recording, t_s=recording.t_s * rng.choice([1e3, 1e-3]))
+
+
 def _dead_chamber(recording: Recording, rng: np.random.Generator) -> Recording:
     """One channel reads one value throughout."""
     measured = recording.measured.copy()
@@ -192,6 +197,7 @@ FAULTS: dict[str, tuple[str, Callable]] = {
     "sign": ("chambers", _flipped),
     "reversed": ("key_points", _reversed),
     "late": ("time", _late),
+    "time unit": ("time_unit", _time_unit),
     "dead key point": ("dead_key_point", _dead_point),
     "dead chamber": ("dead_chamber", _dead_chamber),
 }

@@ -190,15 +190,6 @@ def _shift(evidence: Evidence) -> float:
     return _between(evidence.shift / CLEAR_SHIFT, 0.0, 1.0)
 
 
-def _static_share(evidence: Evidence) -> float:
-    """What any static function explains over what a black box with memory explains, at most 1.
-
-    Where nothing is missing, what a model leaves is mostly what it did not learn of the arm's
-    memory.
-    """
-    return _between(evidence.free_static / max(evidence.free_box, LEAST_EXPLAINED), 0.0, 1.0)
-
-
 def _distinct(evidence: Evidence) -> float:
     """Log of what the third best effect leaves over what the best one leaves; 0 without one.
 
@@ -414,12 +405,6 @@ MISSING = (
         -1,
         _stays,
         "log of the share of the error above the floor that the best proposal leaves",
-    ),
-    Feature(
-        "static",
-        +1,
-        _static_share,
-        "share of what a black box with memory explains that any static function explains",
     ),
     Feature(
         "distinct",

@@ -371,19 +371,6 @@ def test_an_effect_that_helps_in_few_blocks_only_is_uneven():
     assert chances[1] < chances[0]
 
 
-def test_what_only_memory_explains_is_less_probably_missing():
-    """A static function explains 0.1 or 0.8 of the error; with memory 0.9."""
-    place = [feature.name for feature in FEATURES["missing"]].index("static")
-    loud = []
-    for share in (0.1, 0.8):
-        evidence = replace(QUIET, free_static=share, free_box=0.9, proposals=())
-        assert features_of("missing", evidence)[place] == pytest.approx(share / 0.9)
-        loud.append(features_of("missing", evidence)[place])
-    assert loud[0] < loud[1]
-    tiny = replace(QUIET, free_static=0.01, free_box=0.0)
-    assert features_of("missing", tiny)[place] == pytest.approx(0.2)
-
-
 @pytest.mark.parametrize(("third", "distinct"), [(0.4, 0.4), (3.0, 1.0), (None, 0.0)])
 def test_an_effect_is_distinct_as_far_as_the_third_one_leaves_more(third, distinct):
     """The second one may be a relative of it that does the same."""

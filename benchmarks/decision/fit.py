@@ -2,12 +2,11 @@
 
 Each model is fitted by penalised maximum likelihood (ridge: le Cessie & van Houwelingen 1992;
 sign constraints by bounded L-BFGS: Byrd et al. 1995). Every source counts alike, but for one of few
-cases; pairs have a stated share of every source (PRIORS), and in `first` every effect counts alike.
-The penalty of each model is chosen by leaving out one source after another, and one group of robots
-after another, within the cases that it is fitted to. Robots left out inside the same cases also
-give the curves that calibrate the first effect and the set of two (Platt 1999). So nothing of a
-source that is judged enters any choice. The costs of wrong results are stated
-(`surgisoft.diagnosis.criteria.Worth`).
+cases; pairs have a stated share of every source (PRIORS). The penalty of each model is chosen by
+leaving out one source after another, and one group of robots after another, within the cases that
+it is fitted to. Robots left out inside the same cases also give the curves that calibrate the first
+effect and the set of two (Platt 1999). So nothing of a source that is judged enters any choice. The
+costs of wrong results are stated (`surgisoft.diagnosis.criteria.Worth`).
 """
 
 import datetime
@@ -129,37 +128,18 @@ def case_weights(name: str, some: Sequence, twin: float = 1.0) -> np.ndarray:
     share = {True: 1.0 if prior is None else prior, False: 0.0 if prior is None else 1.0 - prior}
     each = [share[kind[1]] * units.sum() / sources / max(number[kind], 1e-9) for kind in kinds]
     weights = np.minimum(np.array(each, float), MOST_WEIGHT) * units
-    if name == "first":
-        weights = _even_over_effects(weights, [case for _, _, case in some])
     return weights * units.sum() / weights.sum()
-
-
-def _even_over_effects(weights: np.ndarray, cases: Sequence[Labelled]) -> np.ndarray:
-    """(N,) weights with which every effect counts alike, and every source as before.
-
-    How often an effect was drawn as missing says nothing of real arms, and would enter its prior
-    weight. A case of two effects has the mean weight of both.
-    """
-    number = Counter(name for case in cases for name in case.truth)
-    even = np.array([np.mean([1.0 / number[name] for name in case.truth]) for case in cases])
-    even = weights * np.minimum(even / even.mean(), MOST_WEIGHT)
-    sources = np.array([case.source for case in cases])
-    for source in np.unique(sources):
-        own = sources == source
-        even[own] *= weights[own].sum() / even[own].sum()
-    return even
 
 
 def log_losses(name: str, model: Logistic, some: Sequence) -> np.ndarray:
     """(N,) negative log likelihood of each case."""
     answer = []
-    for features, right, case in some:
+    for features, right, _ in some:
+        odds = model.log_odds(features)
         if name == "first":
-            odds = model.effect_odds(case.evidence)
             odds = odds - odds.max()
             answer.append(np.log(np.exp(odds).sum()) - np.log(np.exp(odds) @ right))
         else:
-            odds = model.log_odds(features)
             answer.append(np.logaddexp(0.0, odds) - right * odds)
     return np.array(answer, float)
 
@@ -183,10 +163,9 @@ def fit_one(name: str, some: Sequence, penalty: float, twin: float = 1.0) -> Log
     if not some:
         return Logistic(tuple(0.0 for _ in features))
     weights = case_weights(name, some, twin)
-    joint, names = name == "first", []
+    joint = name == "first"
     if joint:
-        names = sorted({name for _, _, case in some for name in case.truth})
-        x, y, there = _padded([(_with_names(rows, case, names), r, case) for rows, r, case in some])
+        x, y, there = _padded(some)
     else:
         x, y = np.array([row for row, _, _ in some]), np.array([right for _, right, _ in some])
 
@@ -212,9 +191,8 @@ def fit_one(name: str, some: Sequence, penalty: float, twin: float = 1.0) -> Log
         return float(total), slope
 
     bounds = [(0.0, None) if sign > 0 else (None, 0.0) for sign in signs]
-    bounds += [(None, None) for _ in names]
     bounds.append((0.0, 0.0) if joint else (None, None))
-    start = np.concatenate([0.1 * signs, np.zeros(len(names) + 1)])
+    start = np.append(0.1 * signs, 0.0)
     found = optimize.minimize(
         loss,
         start,
@@ -223,15 +201,7 @@ def fit_one(name: str, some: Sequence, penalty: float, twin: float = 1.0) -> Log
         bounds=bounds,
         options={"ftol": 1e-13, "gtol": 1e-8, "maxiter": 2000},
     )
-    weights = [float(w) for w in found.x]
-    priors = dict(zip(names, weights[len(signs) : -1], strict=True))
-    return Logistic(tuple(weights[: len(signs)]), weights[-1], priors)
-
-
-def _with_names(rows: np.ndarray, case: Labelled, names: Sequence[str]) -> np.ndarray:
-    """(E, F + M) features of a case's effects, and whether each one has each of M names."""
-    own = np.array([one.effect for one in case.evidence.effects])
-    return np.hstack([rows, own[:, None] == np.array(names)])
+    return Logistic(tuple(float(w) for w in found.x[:-1]), float(found.x[-1]))
 
 
 def _robot_folds(cases: Sequence[Labelled]) -> list[np.ndarray]:
@@ -371,11 +341,6 @@ def fit(cases: Sequence[Labelled], command: str = "") -> dict:
                 feature.name: round(weight, 6)
                 for feature, weight in zip(FEATURES[name], model.weights, strict=True)
             },
-            **(
-                {"priors": {n: round(v, 6) for n, v in model.priors.items()}}
-                if model.priors
-                else {}
-            ),
             "penalty": settings[name].penalty,
             "twin_weight": settings[name].twin,
             "cases": sum(not case.left_out for _, _, case in samples[name]),
@@ -407,7 +372,7 @@ def about(source: str, cases: Sequence[Labelled]) -> dict:
 def model_of(values: dict) -> DecisionModel:
     """The decision of an asset's values."""
     models = {
-        name: Logistic(tuple(one["weights"].values()), one["constant"], one.get("priors", {}))
+        name: Logistic(tuple(one["weights"].values()), one["constant"])
         for name, one in values["models"].items()
     }
     return decision_of(models, values)

@@ -351,17 +351,10 @@ def neighbours(some: Sequence[Judged]) -> str:
 
 def weights(values: dict) -> str:
     """The fitted weights of an asset's values."""
-    lines = [
-        "| model | cases | without truth (weight of each) | ridge | constant; weights; priors |"
-    ]
+    lines = ["| model | cases | without truth (weight of each) | ridge | constant and weights |"]
     lines += ["|---|---|---|---|---|"]
     for name, one in values["models"].items():
-        numbers = (one["weights"], one.get("priors", {}))
-        text = "; ".join(
-            ", ".join(f"{key} {value:+.2f}" for key, value in some.items())
-            for some in numbers
-            if some
-        )
+        text = ", ".join(f"{key} {value:+.2f}" for key, value in one["weights"].items())
         twins = f"{one['without_truth']} ({one['twin_weight']:g})" if one["without_truth"] else "-"
         lines.append(
             f"| {name} | {one['cases']} | {twins} | {one['penalty']:g} "

@@ -12,9 +12,8 @@ probabilities:
   is missing; not asked of a paired difference, which has no error of a model in it.
 
 So P(e) = P(missing) P(known) P(e | known), and two effects e and f are both missing with the
-probability (P(e) + P(f)) P(both | one of them). Every weight of a feature has a fixed sign: more
-evidence for a statement never makes it less probable. Only the prior log odds of the effects may
-have either (`Logistic.priors`). The probabilities of the most probable effect and of the two most
+probability (P(e) + P(f)) P(both | one of them). Every weight has a fixed sign: more evidence
+for a statement never makes it less probable. The probabilities of the most probable effect and of the two most
 probable ones are products of three fits; two curves calibrate them (Platt 1999), and what remains
 to 1 is shared by the others as before. Each statement that could be made has one
 probability (`Statement`), and the result is the one whose worth to its reader, weighed with it, is
@@ -27,7 +26,7 @@ import hashlib
 import json
 import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -203,12 +202,12 @@ def _uneven(evidence: Evidence) -> float:
     of the whole squared error.
 
     A missing effect reduces the error of most blocks alike. One that only imitates the cause
-    reduces that of a few blocks with large errors.
+    reduces that of a few blocks with large errors. 0 where it reduces the others more.
     """
     best = _best(evidence)
     if best is None:
         return 0.0
-    return _between(math.exp(-best.log_gain) - (1.0 - min(best.gain, 1.0)), -1.0, 1.0)
+    return _between(math.exp(-best.log_gain) - (1.0 - min(best.gain, 1.0)), 0.0, 1.0)
 
 
 def _of_box(evidence: Evidence) -> float:
@@ -621,19 +620,10 @@ class Logistic:
     """One for each feature."""
     constant: float = 0.0
     """Log odds where all features are 0."""
-    priors: Mapping[str, float] = field(default_factory=dict)
-    """In the model of which effect it is the prior log odds of each effect; 0 for one that is not
-    among them, such as a user's own. They say how often an effect is the cause where it explains as
-    much as others: some imitate many causes and seldom are it, others imitate few."""
 
     def log_odds(self, features: np.ndarray) -> np.ndarray:
         """(...) log odds of features (..., F)."""
         return self.constant + np.asarray(features, float) @ np.asarray(self.weights)
-
-    def effect_odds(self, evidence: Evidence) -> np.ndarray:
-        """(E,) log odds of each effect in the model of which one it is, up to a constant."""
-        priors = [self.priors.get(one.effect, 0.0) for one in evidence.effects]
-        return self.log_odds(features_of("first", evidence)) + np.array(priors, float)
 
 
 @dataclass(frozen=True)
@@ -709,9 +699,7 @@ def load_decision(path: Path = ASSET) -> DecisionModel:
                 f"{path.name}: model '{name}' has a weight that is not a finite number; fit it "
                 "again"
             )
-        models[name] = Logistic(
-            tuple(map(float, weights.values())), numbers[-1], _priors(one, path)
-        )
+        models[name] = Logistic(tuple(map(float, weights.values())), numbers[-1])
     curves = values.get("calibration", {})
     if not isinstance(curves, dict):
         raise InputError(f"{path.name}: calibration is not a table; fit it again")
@@ -720,14 +708,6 @@ def load_decision(path: Path = ASSET) -> DecisionModel:
         if name not in CALIBRATED or not all(_finite(given.get(k)) for k in ("constant", "slope")):
             raise InputError(f"{path.name}: calibration '{name}' is not readable; fit it again")
     return decision_of(models, values)
-
-
-def _priors(model: dict[str, Any], path: Path) -> dict[str, float]:
-    """The prior log odds of a model's entry in an asset; raises InputError for damaged ones."""
-    priors = model.get("priors", {})
-    if not isinstance(priors, dict) or not all(map(_finite, priors.values())):
-        raise InputError(f"{path.name}: priors are not a table of finite numbers; fit it again")
-    return {name: float(value) for name, value in priors.items()}
 
 
 def _finite(value: Any) -> bool:
@@ -802,7 +782,7 @@ def probabilities(evidence: Evidence, model: DecisionModel | None = None) -> Pro
     network = 0.0 if evidence.paired else chance("network")
     share = np.zeros(0)
     if evidence.effects:
-        odds = model.models["first"].effect_odds(evidence)
+        odds = model.models["first"].log_odds(features_of("first", evidence))
         share = np.exp(odds - odds.max())
         share /= share.sum()
     each = {one.effect: float(p) for one, p in zip(evidence.effects, share, strict=True)}

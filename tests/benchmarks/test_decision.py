@@ -143,7 +143,7 @@ def test_the_conditional_logit_is_a_softmax():
     some = sample("first", some_cases())
     model = fit_one("first", some, 0.3)
     rows = features_of("first", GOOD)
-    odds = rows @ np.array(model.weights) + [model.priors["creep"], 0.0]
+    odds = rows @ np.array(model.weights)
     share = np.exp(odds) / np.exp(odds).sum()
     one = [(rows, np.array([1.0, 0.0]), case(0))]
     assert log_losses("first", model, one)[0] == pytest.approx(-np.log(share[0]))
@@ -174,46 +174,11 @@ def test_how_often_pairs_were_drawn_does_not_count():
     assert weights[20:30].sum() / weights[20:].sum() == pytest.approx(PRIORS["two"])
 
 
-def test_every_effect_counts_alike_in_which_one_it_is():
-    """Nine cases of creep and three of a lag have the same weight; so have both sources."""
-    names = 9 * ["creep"] + 3 * ["line_lag"]
-    some = [case(n, truth=(name,)) for n, name in enumerate(names)]
-    rows = [(np.zeros((2, 1)), np.array([1.0, 0.0]), one) for one in some]
-    weights = case_weights("first", rows)
-    assert weights[:9].sum() == pytest.approx(weights[9:].sum())
-    other = [case(n, "b", truth=("creep",)) for n in range(12)]
-    both = rows + [(np.zeros((2, 1)), np.array([1.0, 0.0]), one) for one in other]
-    weights = case_weights("first", both)
-    assert weights[:12].sum() == pytest.approx(weights[12:].sum())
-
-
 def test_two_effects_are_asked_about_where_one_of_them_is_missing():
     pair = replace(GOOD, proposals=(ALONE, replace(ALONE, effects=("creep", "line_lag"))))
     truths = (("creep", "line_lag"), ("creep",), ("drift",), ("line_lag", "drift"))
     some = sample("two", [case(n, truth=truth, evidence=pair) for n, truth in enumerate(truths)])
     assert [(one.case, float(right)) for _, right, one in some] == [("0", 1), ("1", 0), ("3", 0)]
-
-
-def test_an_effect_that_is_seldom_the_cause_has_the_lesser_prior_odds():
-    """Both always explain alike. Where only creep is ever missing, it has prior odds, and the lag,
-    of which there are no cases, has none; where both are, they have the same, though one was drawn
-    three times as often."""
-    twins = replace(GOOD, effects=(CREEP, replace(CREEP, effect="line_lag")))
-    creep, lag = (
-        sample("first", [case(n, truth=(name,), evidence=twins) for n in range(number)])
-        for name, number in (("creep", 30), ("line_lag", 10))
-    )
-
-    often = fit_one("first", creep, 1.0)
-    assert list(often.priors) == ["creep"]
-    assert often.priors["creep"] > 0.5
-    even = fit_one("first", creep + lag, 1.0)
-    assert even.priors == pytest.approx({"creep": 0.0, "line_lag": 0.0}, abs=1e-6)
-
-
-def test_the_asset_has_prior_odds_of_every_effect_with_cases():
-    missing = {name for one in evidence() if one.label == "known" for name in one.truth}
-    assert set(json.loads(ASSET.read_text())["models"]["first"]["priors"]) == missing
 
 
 def test_a_calibration_gives_back_how_often_effects_are_missing():
@@ -366,7 +331,6 @@ def test_the_stored_evidence_gives_the_weights_of_the_asset(name):
     model = fit_one(name, sample(name, evidence()), one["penalty"], one["twin_weight"])
     assert model.constant == pytest.approx(one["constant"], abs=0.01)
     assert model.weights == pytest.approx(list(one["weights"].values()), abs=0.01)
-    assert dict(model.priors) == pytest.approx(one.get("priors", {}), abs=0.01)
 
 
 def test_stated_values_are_varied_one_at_a_time():

@@ -13,9 +13,9 @@ probabilities:
 
 So P(e) = P(missing) P(known) P(e | known), and two effects e and f are both missing with the
 probability (P(e) + P(f)) P(both | one of them). Every weight has a fixed sign: more evidence
-for a statement never makes it less probable. The probabilities of the most probable effect and of the two most
-probable ones are products of three fits; two curves calibrate them (Platt 1999), and what remains
-to 1 is shared by the others as before. Each statement that could be made has one
+for a statement never makes it less probable. The probabilities of the most probable effect and of
+the two most probable ones are products of three fits; two curves calibrate them (Platt 1999), and
+what remains to 1 is shared by the others as before. Each statement that could be made has one
 probability (`Statement`), and the result is the one whose worth to its reader, weighed with it, is
 largest (`criteria.Worth`; Savage 1954). "Cannot tell" is worth 0 (Chow 1970: a statement that is
 not made), so it is the result only where no statement is probable enough. Weights, curves, sources

@@ -186,8 +186,8 @@ def test_over_a_whole_episode_the_same_measurements_give_the_same_commands(ring)
     policy, task, episode = ring
     assert episode.decisions > 400
     found = same_measurements(running(ControllerGraph(task, policy.actors)), episode)
-    assert 0.0 < found.points_mm < AGREE_MM
-    assert 0.0 < found.commands_kPa < AGREE_KPA
+    assert found.points_mm < AGREE_MM  # 0 where a processor rounds both programs alike
+    assert found.commands_kPa < AGREE_KPA
 
 
 @pytest.mark.parametrize("wrong", ["pumps", "transients"])

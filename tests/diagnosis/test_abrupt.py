@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from surgisoft.diagnosis.abrupt import body_jumps, jumps_in, key_point_shift
+from surgisoft.diagnosis.decision import decide
 from surgisoft.diagnosis.diagnose import diagnose, jumping, slipped
 from surgisoft.diagnosis.evidence import abrupt_changes
 from surgisoft.diagnosis.pairs import before_and_after
@@ -158,7 +159,7 @@ def test_the_words_say_what_was_put_in():
     assert "times, by up to" in told
 
 
-def test_the_result_says_it_once():
+def test_the_result_says_it_once(monkeypatch):
     """A slip is a jump, too, but is told as a slip; beside a named effect both are checks."""
     told = diagnose(still_model(), [moved_by(bending() + shifted(2, 500, [0.0, 1.6, 0.0]))])
     words = (told.verdict.sentence, *told.checks)
@@ -169,8 +170,15 @@ def test_the_result_says_it_once():
     many = diagnose(still_model(), [moved_by(stuck())])
     words = (many.verdict.sentence, *many.checks)
     assert sum("the body jumps" in each for each in words) == 1
-    assert many.verdict.kind == "surrogate_undertrained"
-    assert any("the body jumps" in each for each in many.checks)
+    assert many.verdict.kind == "unknown_effect"
+    assert "the body jumps" in many.verdict.sentence
+    monkeypatch.setattr(
+        "surgisoft.diagnosis.diagnose.decide",
+        lambda evidence: replace(decide(evidence), kind="cannot_tell", reason="schedule"),
+    )
+    other = diagnose(still_model(), [moved_by(stuck())])
+    assert "the body jumps" not in other.verdict.sentence
+    assert sum("the body jumps" in each for each in other.checks) == 1
 
 
 def test_a_stored_model_keeps_its_jumps(tmp_path):

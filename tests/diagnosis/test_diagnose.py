@@ -86,7 +86,8 @@ def test_command_writes_the_promised_json(tmp_path, capsys):
     said = json.loads(out.read_text())
     assert said["verdict"]["kind"] == "identified"
     assert said["verdict"]["effects"] == ["misalignment"]
-    assert set(said["error_mm"]) == {"before", "floor", "best_achievable", "ceiling"}
+    levels = {"before", "floor", "best_achievable", "ceiling", "validated", "discrepancy_alone"}
+    assert set(said["error_mm"]) == levels
     assert said["error_mm"]["ceiling"] == said["error_mm"]["best_achievable"]
     assert {"effect", "confidence", "gain_alone", "gain_unique", "heldout_rmse_mm", "ci95"} <= set(
         said["ranking"][0]

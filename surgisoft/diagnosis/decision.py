@@ -76,6 +76,8 @@ model is said to have learned part of what is missing."""
 LEAST_LEFT = 0.02
 """Share of what can be explained that no proposal is taken to fall below: a fiftieth is within what
 the noise floor is known."""
+LEAST_UNIQUE = 0.02
+"""Sum of unique shares below which their parts say little: no more than `LEAST_LEFT` returns."""
 LEAST_EXPLAINED = 0.05
 """Share of what can be explained below which a black box is taken to explain nothing."""
 FORM_SHARE = 0.02
@@ -304,7 +306,7 @@ def _unique_share(effect: EffectEvidence, evidence: Evidence) -> float:
     returns over all others says whether the data need it.
     """
     each = [_between(one.unique, 0.0, 1.0) for one in evidence.effects]
-    return _between(effect.unique, 0.0, 1.0) / (sum(each) + LEAST_LEFT)
+    return _between(effect.unique, 0.0, 1.0) / (sum(each) + LEAST_UNIQUE)
 
 
 def _least_unique(evidence: Evidence) -> float:
@@ -485,7 +487,8 @@ KNOWN = (
         "uneven",
         -1,
         _uneven,
-        "what the best effect leaves in a block on average over what it leaves of the whole error",
+        "share that the best effect leaves in a block (geometric mean) less the share that it "
+        "leaves of the whole squared error, at least 0",
     ),
     *BEYOND_HISTORY,
     Feature(

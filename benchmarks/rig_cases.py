@@ -24,7 +24,7 @@ import itertools
 import json
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -135,6 +135,12 @@ class Generator:
     tries: int = 0
     """Strengths that are tried for an effect on the schedule of its case; 0: one, on a short
     schedule, for a generator that is slow."""
+    longer: float = 1.0
+    """Factor on the durations of all recordings, before and after a change [-]."""
+
+    def duration_s(self, robot: int, name: str) -> float:
+        """Duration of a recording before the change [s]; name: of BEFORE."""
+        return self.longer * self.before_s(robot)[name]
 
 
 @dataclass(frozen=True)
@@ -233,9 +239,10 @@ def _ordered(parts: tuple[np.ndarray, np.ndarray, np.ndarray]) -> tuple:
 def after_protocol(generator: Generator, rig: CaseRig, robot: int, after: str) -> Schedule:
     """The protocol of a recording after the change."""
     if after == "same":
-        seconds = generator.before_s(robot)["mixed"]
+        seconds = generator.duration_s(robot, "mixed")
         return excitation(rig, "mixed", AFTER[after], seconds, robot)
-    return excitation(rig, f"after_{after}", AFTER[after], AFTER_S[after], robot)
+    seconds = generator.longer * AFTER_S[after]
+    return excitation(rig, f"after_{after}", AFTER[after], seconds, robot)
 
 
 def record(rig: CaseRig, protocol: Schedule) -> tuple[Recording, np.ndarray]:
@@ -251,11 +258,10 @@ def make_robot(generator: Generator, folder: Path, robot: int) -> None:
         return
     (place / "before").mkdir(parents=True, exist_ok=True)
     plain = {}
-    seconds = generator.before_s(robot)
     noise: list[float | None] = []
     for take, (name, signals) in enumerate(BEFORE.items()):
         rig = generator.rig(robot, take=take)
-        protocol = excitation(rig, name, signals, seconds[name], robot)
+        protocol = excitation(rig, name, signals, generator.duration_s(robot, name), robot)
         recording, points = record(rig, protocol)
         save_recording(recording, place / "before" / f"{name}.parquet", force=True)
         noise.append(recording.noise_mm)
@@ -398,9 +404,11 @@ def main(generator: Generator, about: str, robots: str) -> None:
     parser.add_argument("--count", type=int, default=100, help="cases of the rounds")
     parser.add_argument("--pairs", type=int, default=0, help="further cases of two effects")
     parser.add_argument("--unknown", type=int, default=0, help="further cases of unknown effects")
+    parser.add_argument("--longer", type=float, default=1.0, help="factor on all durations")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--processes", type=int, default=1)
     given = parser.parse_args()
+    generator = replace(generator, longer=given.longer)
     seeds = [int(word) for word in given.robots.split(",")]
     drawn = [
         *cases(generator, seeds, given.count, given.seed),

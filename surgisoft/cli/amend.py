@@ -71,8 +71,8 @@ def amend(
         typer.Option(
             "--keep-network",
             help="Do not change the network. By default its last layer is fitted again with the "
-            "effects if that lowers the error in every quarter of the training part that is left "
-            "out of both fits.",
+            "effects if that lowers the error of the quarters of the training part that are left "
+            "out of both fits in turn.",
         ),
     ] = False,
     refit: Refit = "auto",
@@ -138,8 +138,8 @@ def amend(
     show_parameters(result.parameters, result.in_words)
     if result.retuned:
         print(
-            "the network's last layer was fitted again, which lowers the error in every quarter of "
-            "the training part that was left out of both fits"
+            "the network's last layer was fitted again, which lowers the error of the quarters of "
+            "the training part that were left out of both fits in turn"
         )
     if result.refit is not None:
         print(f"{result.refit.sentence}, with parts of the training data left out")

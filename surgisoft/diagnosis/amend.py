@@ -220,11 +220,15 @@ class Amendment:
             return f"{text}, its network's last layer re-tuned" if self.retuned else text
         if not self.retuned:
             return text
+        # The held-out rows choose nothing, so the layer stays where it errs more on them.
+        less = self.alone.after < self.held_out.after
+        keep = ", less here: --keep-network leaves the layer as it was" if less else ""
         if not self.claimed:
-            return f"{text}; {self.held_out.after:.3f} mm with the network's last layer re-tuned"
+            text += f"; {self.held_out.after:.3f} mm with the network's last layer re-tuned"
+            return text + (keep and f", and {self.alone.after:.3f} mm without that{keep}")
         return (
             f"{' + '.join(self.effects)}: {self.held_out.sentence}, with the network's last layer "
-            f"re-tuned; {self.alone.after:.3f} mm with the effects alone"
+            f"re-tuned; {self.alone.after:.3f} mm with the effects alone{keep}"
         )
 
     @property
@@ -307,8 +311,8 @@ def amend(
 
     effects: names, or files of user-defined effects (`my_effect.py`), which are run.
     retune_network: also re-tune the network's last layer, where the effects alone make the error of
-    the training rows fall and the new layer lowers it in every quarter of them that is left out of
-    both fits (`estimation.network`). before: recordings
+    the training rows fall and the new layer lowers it in the quarters of them that are left out of
+    both fits in turn (`estimation.network`). before: recordings
     from before a change. Where they were made with the same actuation, effects are fitted to the
     paired difference (`pairs`), so that the network's error does not enter; otherwise to the
     model's residuals, as without before (a note says so); paired: as for `diagnose`.

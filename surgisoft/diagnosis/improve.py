@@ -1,8 +1,8 @@
 """`improve`: diagnose and amend in turn, until no further effect is significant.
 
 Every round adds an effect that a diagnosis names and fits it together with those that were added
-before. The network's last layer is re-tuned at the end, where every quarter of the training rows
-that is left out of the fits rewards it (`estimation.network`). All of this sees the training rows
+before. The network's last layer is re-tuned at the end, where the quarters of the training rows
+that are left out of the fits in turn reward it (`estimation.network`). All of this sees the training rows
 of the recordings only; the held-out rows are evaluated once, at the end, for the errors of all
 rounds, and decide nothing but whether the whole fall is claimed.
 
@@ -341,8 +341,8 @@ def improve(
             after = fall_of(problem, problem.with_model(tuned.model)).after
             why = (
                 f"the network's last layer, re-tuned, lowers the squared error by "
-                f"{100 * tuned.gain:.0f} % in quarters of the training part that were left out of "
-                "its fit and of the effects' fit, and lowers it in each of them"
+                f"{100 * tuned.gain:.0f} % in the quarters of the training part that were left out "
+                "of its fit and of the effects' fit in turn"
             )
             made.append(replace(made[-1], model=tuned.model, known=None))
             note(Round(RETUNED, why, NETWORK, (), None, after))

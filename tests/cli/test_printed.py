@@ -342,7 +342,7 @@ def test_amend_and_improve_write_nothing_where_nothing_is_claimed(
     )  # fmt: skip
     assert "creep: the model had this effect already; its parameters were fitted again\n" in out
     assert "  creep: tau = 3 s (2 to 4), before 2.5 s\n" in out
-    assert "which lowers the error in every quarter of the training part that was left o" in out
+    assert "which lowers the error of the quarters of the training part that were left o" in out
     assert "creep lowers it, with parts of the training data left out\n" in out
     assert f"{new} was not written; --anyway writes it nevertheless" in out
     assert not Path(new).exists()

@@ -13,7 +13,7 @@ The ridge is the one with the least error on motion that is held out in turn, so
 little about whether the new layer helps: the ridge was selected on it, and the effects in front of
 the network were fitted to all of it. So the layer is judged once more, by a nested validation
 (Varma & Simon 2006): each quarter of the time is left out of the fit of the effects, of the choice
-of the ridge and of the layer, and the layer is kept only where it lowers the error in every one.
+of the ridge and of the layer, and the layer is kept only where it lowers the error over all four.
 """
 
 import copy
@@ -52,7 +52,7 @@ class Retuned:
     model: ArmModel
     """The model with the new layer, or the old one where that was not rewarded."""
     kept: bool
-    """Whether every left-out quarter rewards the new layer."""
+    """Whether the left-out quarters together reward the new layer."""
     gain: float
     """Fall of the squared error over the quarters that were left out of both fits, as a share of
     it; where the layer was rejected before they were looked at, over the parts that its ridge was
@@ -71,15 +71,16 @@ def retune(model: ArmModel, problem: Problem, effects: Iterable[str] = ()) -> Re
     tuned = best_layer(model, problem)
     if not tuned.kept:
         return tuned
-    before = after = 0.0
+    left: list[tuple[np.ndarray, np.ndarray]] = []
     for out in _quarters(problem):
         unseen = problem.without_blocks(~out)
         alone, both = _fitted_without(problem.without_blocks(out), tuple(effects))
-        sums = [_squares(unseen.with_model(each)) for each in (alone, both)]
-        if not _falls(*sums):
-            return Retuned(model, False, 1.0 - float(sums[1].sum() / sums[0].sum()))
-        before, after = before + float(sums[0].sum()), after + float(sums[1].sum())
-    return Retuned(tuned.model, True, 1.0 - after / before)
+        left.append((_squares(unseen.with_model(alone)), _squares(unseen.with_model(both))))
+    before, after = (np.concatenate(sums) for sums in zip(*left, strict=True))
+    kept = _falls(before, after)
+    return Retuned(
+        tuned.model if kept else model, kept, 1.0 - float(after.sum() / before.sum())
+    )
 
 
 def _quarters(problem: Problem) -> Iterator[np.ndarray]:

@@ -12,7 +12,7 @@ from surgisoft.errors import InputError
 from surgisoft.measurement.histories import check_fits, history_of, outside_range
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.surrogate.checkpoint import load_model
-from surgisoft.surrogate.fitted_rows import IN_WORDS
+from surgisoft.surrogate.fitted_rows import Seen
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 
@@ -45,32 +45,28 @@ def part_in_fit(model: ArmModel, recordings: list[Recording]) -> tuple[str, ...]
 
     Errors there are errors of the fit and no test of the model.
     """
-    advice = {
-        True: "further effects may be sought there, and only other recordings test the model",
-        False: "use recordings that took no part in the fit",
-    }
     return tuple(
-        f"{recording.name}: {words}: the error there is no test; "
-        f"{advice[words.startswith(EFFECTS_ALONE)]}"
-        for recording, words in zip(recordings, words_in_fit(model, recordings), strict=True)
-        if words
+        f"{recording.name}: {seen.words}: the error there is no test; "
+        + (
+            "further effects may be sought there, and only other recordings test the model"
+            if seen.effects_alone
+            else "use recordings that took no part in the fit"
+        )
+        for recording, seen in zip(recordings, seen_in_fit(model, recordings), strict=True)
+        if seen
     )
 
 
-EFFECTS_ALONE = IN_WORDS["amended"].partition("{}")[0]
-"""Begin of the words on rows that the network has not seen (`FittedRows.words_of`)."""
+def seen_in_fit(model: ArmModel, recordings: Iterable[Recording]) -> list[Seen]:
+    """What the model has seen of each recording.
 
-
-def words_in_fit(model: ArmModel, recordings: Iterable[Recording]) -> list[str]:
-    """What the model has seen of each recording in words, empty for nothing.
-
-    Rows are recognised by their content (`FittedRows`). Empty also where the model keeps no record.
+    Rows are recognised by their content (`FittedRows`). Nothing where the model keeps no record.
     """
     known = model.fitted_rows
+    if known is None:
+        return [Seen({}) for _ in recordings]
     return [
-        ""
-        if known is None
-        else known.words_of(history_of([each], model.spec.actuation), held_out_rows([each]))
+        known.seen_of(history_of([each], model.spec.actuation), held_out_rows([each]))
         for each in recordings
     ]
 
@@ -78,10 +74,10 @@ def words_in_fit(model: ArmModel, recordings: Iterable[Recording]) -> list[str]:
 def refuse_rows_of_fit(model: ArmModel, recordings: Iterable[Recording]) -> None:
     """Raise InputError unless the recordings are known to have taken no part in the model's fit."""
     recordings = list(recordings)
-    for recording, words in zip(recordings, words_in_fit(model, recordings), strict=True):
-        if words:
+    for recording, seen in zip(recordings, seen_in_fit(model, recordings), strict=True):
+        if seen:
             raise InputError(
-                f"{recording.label}: {words}, expected a recording that took no part in the fit; "
+                f"{recording.label}: {seen.words}, expected a recording that took no part in the fit; "
                 "give another one, or leave out --test to see the error of the fit"
             )
     if model.fitted_rows is None or not model.fitted_rows.complete:

@@ -23,7 +23,7 @@ from surgisoft.agents.on_rig import RigConfig, on_rig
 from surgisoft.agents.policies import POLICIES, Policy, check_policy, open_policy
 from surgisoft.agents.run_folder import RunFolder, run_path
 from surgisoft.agents.session import task_config
-from surgisoft.diagnosis.inputs import words_in_fit
+from surgisoft.diagnosis.inputs import seen_in_fit
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.files import json_safe
 from surgisoft.live.change import (
@@ -716,10 +716,10 @@ class _Session:
 
     def _detector(self, before: list[Recording]) -> Detector:
         """The detector from recordings of the unchanged arm."""
-        for recording, words in zip(before, words_in_fit(self.model, before), strict=True):
-            if words:
+        for recording, seen in zip(before, seen_in_fit(self.model, before), strict=True):
+            if seen:
                 self.on_warning(
-                    f"{recording.name}: {words}, "
+                    f"{recording.name}: {seen.words}, "
                     "and its error is smaller there than in the run: false alarms may come more "
                     "often than stated; give an unseen recording by --before"
                 )

@@ -37,6 +37,29 @@ LEAST_KNOWN = 0.02
 
 
 @dataclass(frozen=True)
+class Seen:
+    """What a model has seen of some rows."""
+
+    shares: dict[Use, float]
+    """Share 0..1 of the rows in each use that counts; empty where the model has seen none."""
+
+    def __bool__(self) -> bool:
+        return bool(self.shares)
+
+    @property
+    def effects_alone(self) -> bool:
+        """Whether nothing but effects was fitted to rows that the model has seen."""
+        return set(self.shares) == {"amended"}
+
+    @property
+    def words(self) -> str:
+        """The same in words, with the shares; empty for nothing."""
+        return " and ".join(
+            IN_WORDS[use].format(f"{100 * share:.0f} %") for use, share in self.shares.items()
+        )
+
+
+@dataclass(frozen=True)
 class FittedRows:
     """A sketch of the rows that a model was fitted to."""
 
@@ -143,18 +166,13 @@ class FittedRows:
         share = self.part_of(history, parts=parts)
         return share if share or self.complete else None
 
-    def words_of(self, history: History, parts: np.ndarray | None = None) -> str:
-        """What the model has seen of a history in words, with shares of its rows; empty for
-        nothing."""
+    def seen_of(self, history: History, parts: np.ndarray | None = None) -> Seen:
+        """What the model has seen of a history; parts: as for `uses_of`."""
         shares = self.uses_of(history, parts=parts)
         if sum(shares.values()) < LEAST_KNOWN:
-            return ""
+            return Seen({})
         least = min(LEAST_KNOWN, max(shares.values()))
-        return " and ".join(
-            text.format(f"{100 * shares[use]:.0f} %")
-            for use, text in IN_WORDS.items()
-            if shares[use] >= least
-        )
+        return Seen({use: shares[use] for use in IN_WORDS if shares[use] >= least})
 
     def to_json(self) -> dict:
         """Plain values for a model's `config.json`."""

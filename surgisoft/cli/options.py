@@ -67,8 +67,8 @@ Paired = Annotated[
     str,
     Option(
         metavar="auto|always|never",
-        help="Whether rows of the same actuation before and after are paired; 'always' makes it an "
-        "error if too few can be.",
+        help="Whether rows of the same actuation before and after are paired: 'auto' if at least "
+        "half of them can be, 'always' if a minute of them can be, and it is an error otherwise.",
     ),
 ]
 NewModel = Annotated[Path, Option("-o", "--output", metavar="NEW", help="Folder of the new model.")]

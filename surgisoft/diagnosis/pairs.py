@@ -91,9 +91,10 @@ IDLE = 0.1
 idle: as much as two motions may differ (`residuals.MOTION_ALIKE`)."""
 LEAST_SHARE = 0.5
 """Share of the training rows of AFTER that must have a partner for the paired difference to be
-used, or:"""
+used: it says nothing of the other rows. Two schedules of ten minutes that were drawn by chance have
+minutes of rest and of equal ramps in common, which need not show what changed."""
 LEAST_S = 60.0
-"""time with a partner from which fewer do, s."""
+"""Time with a partner from which fewer do where pairs are asked for (`--paired always`), s."""
 SPECTRUM_S = 20.0
 """Longest stretch of a power spectrum, s: four blocks of time."""
 FREE_POWER = 4.0
@@ -598,15 +599,17 @@ def _between(values: np.ndarray, lower: np.ndarray, share: np.ndarray) -> np.nda
     return first + np.where(w > 0, values[upper], 0.0) * w
 
 
-def paired_table(after: ResidualTable, before: ResidualTable) -> tuple[ResidualTable | None, Pairs]:
+def paired_table(
+    after: ResidualTable, before: ResidualTable, asked: bool = False
+) -> tuple[ResidualTable | None, Pairs]:
     """AFTER's table with the paired difference in place of the residual, and the pairs.
 
     The measured key points become those that would have been measured if the model made no other
     errors after than before: measured less the partner's residual. Rows without a partner are NaN.
-    None where too few rows have one.
+    None where too few rows have one; asked: whether a minute of them is enough.
     """
     pairs = _pairs(after, before, _partners(after, before))
-    if not _enough(after, pairs):
+    if not _enough(after, pairs, asked):
         return None, pairs
     change, noise = pairs.change_mm, pairs.noise_mm
     measured = after.predicted_mm + change
@@ -755,7 +758,7 @@ def without_noise(
     is slower than PAST_S is taken for real. Of the rest a share is, found by regression of the
     steps of the measured difference on those of the correction (training rows, one number).
     """
-    if not after.timed.any():
+    if not asked or not after.timed.any():
         return correction_mm
     slow = np.full_like(correction_mm, np.nan)
     for signal in run_signals(after, False):
@@ -855,15 +858,21 @@ def _spectrum(values: np.ndarray) -> np.ndarray:
     return spectrum
 
 
-def _enough(after: ResidualTable, pairs: Pairs) -> bool:
-    """Whether enough of the training rows have a partner to diagnose the paired difference."""
+def _enough(after: ResidualTable, pairs: Pairs, asked: bool) -> bool:
+    """Whether enough of the training rows have a partner to diagnose the paired difference.
+
+    asked: whether fewer than LEAST_SHARE are enough if they last for LEAST_S.
+    """
     shown = np.isfinite(after.measured_mm).all(2).any(1) & ~after.held_out
     both = shown & np.isfinite(pairs.change_mm).all(2).any(1)
     if both.sum() < 2 * LEAST_BLOCKS * BLOCK_ROWS:
         return False
+    if both.sum() >= LEAST_SHARE * shown.sum():
+        return True
+    if not asked or not after.timed.any():
+        return False
     step = np.median(np.concatenate([np.diff(s.t_s) for s in run_signals(after, False)]))
-    enough_time = after.timed.any() and both.sum() * step >= LEAST_S
-    return bool(both.sum() >= LEAST_SHARE * shown.sum() or enough_time)
+    return bool(both.sum() * step >= LEAST_S)
 
 
 def _repeatability(before: ResidualTable) -> tuple[np.ndarray, str]:
@@ -932,8 +941,8 @@ def slope_error(table: ResidualTable) -> float:
 # Before and after ----------------------------------------------------------------------------
 
 Paired = str
-"""Whether rows are paired: where enough have a partner, or it is an error if too few have, or not
-at all."""
+"""Whether rows are paired: where half of them have a partner, or where a minute of them has, else
+it is an error, or not at all."""
 PAIRED: tuple[Paired, ...] = ("auto", "always", "never")
 
 
@@ -1045,9 +1054,11 @@ class BeforeAfter:
         if self.used:
             return ()
         share = float(self.pairs.paired[~self.table.held_out].mean())
+        few = _enough(self.plain, self.pairs, asked=True)
+        alone = ", or explain the change in these rows alone by --paired always" if few else ""
         return (
             f"{100 * share:.0f} % of the rows were recorded with the same actuation as "
-            f"{self.names}: {instead}; record the same protocol before and after",
+            f"{self.names}: {instead}; record the same protocol before and after{alone}",
         )
 
 
@@ -1068,7 +1079,7 @@ def before_and_after(
         return BeforeAfter(
             table, table, other, _pairs(table, other, _partners(table, empty)), False
         )
-    found, pairs = paired_table(table, other)
+    found, pairs = paired_table(table, other, asked=paired == "always")
     if found is None and paired == "always":
         raise InputError(
             f"{' + '.join(table.names)}: only {100 * pairs.paired.mean():.0f} % of the rows were "

@@ -303,6 +303,20 @@ def test_no_common_motion_is_a_note_and_an_error_if_pairs_are_asked_for(model):
         diagnose(model, [after], before=[before], paired="perhaps")
 
 
+def test_a_minute_of_pairs_is_explained_only_where_pairs_are_asked_for(model):
+    """Of three recordings of 100 s one repeats BEFORE: what changed may show in the two others."""
+    motion, rows = smooth_walk(3), round(100.0 / PERIOD_S)
+    before = made(motion, 0.0, rows=rows, seed=9, name="earlier")
+    after = [made(smooth_walk(10 + k), 0.0, rows=rows, seed=k, name=f"new{k}") for k in (1, 2)]
+    table = residual_table(model, [made(motion, 0.0, rows=rows), *after])
+    found = before_and_after(table, [before])
+    assert not found.used
+    assert "by --paired always" in found.notes[0]
+    assert before_and_after(table, [before], "always").used
+    short = before_and_after(residual_table(model, after), [before])
+    assert "--paired always" not in short.notes[0]
+
+
 def test_an_effect_that_is_fitted_without_pairs_is_said_to_be_fitted_as_without_before(model):
     after, before = made(smooth_walk(10), 1.0), made(smooth_walk(11), 0.0, seed=2, name="other")
     settings = {"retune_network": False, "refit": "never"}

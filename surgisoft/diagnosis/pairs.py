@@ -758,7 +758,7 @@ def without_noise(
     is slower than PAST_S is taken for real. Of the rest a share is, found by regression of the
     steps of the measured difference on those of the correction (training rows, one number).
     """
-    if not asked or not after.timed.any():
+    if not after.timed.any():
         return correction_mm
     slow = np.full_like(correction_mm, np.nan)
     for signal in run_signals(after, False):

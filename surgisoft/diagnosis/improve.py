@@ -2,9 +2,9 @@
 
 Every round adds an effect that a diagnosis names and fits it together with those that were added
 before. The network's last layer is re-tuned at the end, where the quarters of the training rows
-that are left out of the fits in turn reward it (`estimation.network`). All of this sees the training rows
-of the recordings only; the held-out rows are evaluated once, at the end, for the errors of all
-rounds, and decide nothing but whether the whole fall is claimed.
+that are left out of the fits in turn reward it (`estimation.network`). All of this sees the
+training rows of the recordings only; the held-out rows are evaluated once, at the end, for the
+errors of all rounds, and decide nothing but whether the whole fall is claimed.
 
 With recordings from before a change, every round diagnoses and amends that change: the paired
 difference, of which the given model predicts BEFORE in all rounds, or the model's residuals less

@@ -77,8 +77,8 @@ def refuse_rows_of_fit(model: ArmModel, recordings: Iterable[Recording]) -> None
     for recording, seen in zip(recordings, seen_in_fit(model, recordings), strict=True):
         if seen:
             raise InputError(
-                f"{recording.label}: {seen.words}, expected a recording that took no part in the fit; "
-                "give another one, or leave out --test to see the error of the fit"
+                f"{recording.label}: {seen.words}, expected a recording that took no part in the "
+                "fit; give another one, or leave out --test to see the error of the fit"
             )
     if model.fitted_rows is None or not model.fitted_rows.complete:
         raise InputError(

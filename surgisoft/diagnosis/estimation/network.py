@@ -78,9 +78,7 @@ def retune(model: ArmModel, problem: Problem, effects: Iterable[str] = ()) -> Re
         left.append((_squares(unseen.with_model(alone)), _squares(unseen.with_model(both))))
     before, after = (np.concatenate(sums) for sums in zip(*left, strict=True))
     kept = _falls(before, after)
-    return Retuned(
-        tuned.model if kept else model, kept, 1.0 - float(after.sum() / before.sum())
-    )
+    return Retuned(tuned.model if kept else model, kept, 1.0 - float(after.sum() / before.sum()))
 
 
 def _quarters(problem: Problem) -> Iterator[np.ndarray]:

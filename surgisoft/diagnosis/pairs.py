@@ -131,41 +131,38 @@ class Stretch:
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """The partners of the N rows of AFTER in BEFORE, and how well BEFORE repeats itself."""
+    """The partners of the N rows of AFTER in BEFORE, and how well BEFORE repeats itself.
 
-    before: tuple[str, ...]
-    """Names of the recordings of BEFORE."""
-    stretches: tuple[Stretch, ...]
-    """What was paired with what, the longest first."""
-    partners: np.ndarray
-    """(N,) runs of BEFORE that a row has a partner in; partners are averaged."""
-    partner_t_s: np.ndarray
-    """(N,) time of the first partner in its recording, s; NaN where there is none."""
-    after_mm: np.ndarray
-    """(N, n, 3) measured key points of AFTER, base frame, mm; NaN where missing."""
-    before_mm: np.ndarray
-    """(N, n, 3) measured key points of the partner, corrected for the difference of the actuation,
-    base frame, mm; NaN where there is none."""
-    body_mm: np.ndarray
-    """(N, n, 3) motion of BEFORE in every row of AFTER, as far as it comes again, mm, see
-    `body_before`."""
-    correction_mm: np.ndarray
-    """(N, n, 3) what the model says the difference of the actuation does, mm."""
-    repeatability_mm: np.ndarray
-    """(n,) RMS distance by which two recordings of the same motion differ at each key point where
-    nothing has changed, for one recording (their difference over root two), mm."""
-    source: str
-    """Where the repeatability is from: `repeats` of BEFORE, or `noise` where it has none."""
-    free_mm: np.ndarray
-    """(n,) RMS of the change at the frequencies of free motion, mm, see `free_motion`."""
-    noise_mm: np.ndarray
-    """(n,) RMS noise of the paired difference of each key point, free motion included, mm."""
-    discrepancy_mm: np.ndarray
-    """(n,) what takes the place of the model discrepancy, mm, see `paired_discrepancy`."""
-    tolerance_mm: np.ndarray
-    """(n,) what the right effect may leave, mm: the discrepancy, the share of the change that the
-    sensitivities of the effects are off by (`slope_error`), and where BEFORE has no repeats slow
-    noise of the size of its noise floor."""
+    What is made of the partners is computed when it is read: where too few rows have one, nothing
+    is. What pairs say about errors is of training rows.
+    """
+
+    after: ResidualTable
+    """Residuals of the model on AFTER."""
+    earlier: ResidualTable
+    """Residuals of the model on BEFORE."""
+    found: "_Found"
+    """The partners."""
+
+    @property
+    def before(self) -> tuple[str, ...]:
+        """Names of the recordings of BEFORE."""
+        return self.earlier.names
+
+    @property
+    def stretches(self) -> tuple[Stretch, ...]:
+        """What was paired with what, the longest first."""
+        return self.found.stretches
+
+    @property
+    def partners(self) -> np.ndarray:
+        """(N,) runs of BEFORE that a row has a partner in; partners are averaged."""
+        return self.found.partners
+
+    @property
+    def partner_t_s(self) -> np.ndarray:
+        """(N,) time of the first partner in its recording, s; NaN where there is none."""
+        return self.found.partner_t_s
 
     @property
     def paired(self) -> np.ndarray:
@@ -173,9 +170,71 @@ class Pairs:
         return self.partners > 0
 
     @property
+    def after_mm(self) -> np.ndarray:
+        """(N, n, 3) measured key points of AFTER, base frame, mm; NaN where missing."""
+        return self.after.measured_mm
+
+    @property
+    def before_mm(self) -> np.ndarray:
+        """(N, n, 3) measured key points of the partner, corrected for the difference of the
+        actuation, base frame, mm; NaN where there is none."""
+        return self._measured_before_mm + self.correction_mm
+
+    @cached_property
     def change_mm(self) -> np.ndarray:
         """(N, n, 3) paired difference: AFTER less BEFORE, mm; NaN where a row has no partner."""
         return self.after_mm - self.before_mm
+
+    @cached_property
+    def correction_mm(self) -> np.ndarray:
+        """(N, n, 3) what the model says the difference of the actuation does, mm."""
+        correction = self.after.predicted_mm - self.found.predicted_mm
+        return without_noise(self.after, self.after_mm - self._measured_before_mm, correction)
+
+    @cached_property
+    def body_mm(self) -> np.ndarray:
+        """(N, n, 3) motion of BEFORE in every row of AFTER, as far as it comes again, mm, see
+        `body_before`."""
+        return body_before(self.after, self.before_mm, self._repeated)
+
+    @cached_property
+    def free_mm(self) -> np.ndarray:
+        """(n,) RMS of the change at the frequencies of free motion, mm, see `free_motion`."""
+        measured, predicted = self._measured_before_mm, self.found.predicted_mm
+        return free_motion(self.after, measured, predicted, self.change_mm, self._repeated)
+
+    @property
+    def repeatability_mm(self) -> np.ndarray:
+        """(n,) RMS distance by which two recordings of the same motion differ at each key point
+        where nothing has changed, for one recording (their difference over root two), mm."""
+        return self._repeatability[0]
+
+    @property
+    def source(self) -> str:
+        """Where the repeatability is from: `repeats` of BEFORE, or `noise` where it has none."""
+        return self._repeatability[1]
+
+    @property
+    def noise_mm(self) -> np.ndarray:
+        """(n,) RMS noise of the paired difference of each key point, free motion included, mm."""
+        return np.maximum(self._fast_noise_mm, self.free_mm)
+
+    @cached_property
+    def discrepancy_mm(self) -> np.ndarray:
+        """(n,) what takes the place of the model discrepancy, mm, see `paired_discrepancy`."""
+        correction = self.correction_mm[~self.after.held_out]
+        noise, slope = self._fast_noise_mm, slope_error(self.after)
+        return paired_discrepancy(self.repeatability_mm, correction, noise, slope)
+
+    @cached_property
+    def tolerance_mm(self) -> np.ndarray:
+        """(n,) what the right effect may leave, mm: the discrepancy, the share of the change that
+        the sensitivities of the effects are off by (`slope_error`), and where BEFORE has no repeats
+        slow noise, which may be as large as fast noise."""
+        slow = self._fast_noise_mm if self.source == "noise" else 0.0
+        change = rms_by_point(self.change_mm[~self.after.held_out])
+        slope = slope_error(self.after)
+        return np.sqrt(self.discrepancy_mm**2 + slow**2 + (slope * change) ** 2)
 
     def unchanged_mm(self, rows: np.ndarray) -> np.ndarray:
         """(n,) RMS paired difference of a key point, mm, over rows (N,) bool, if nothing changed.
@@ -184,6 +243,28 @@ class Pairs:
         """
         partners = self.partners[rows & self.paired]
         return self.repeatability_mm * np.sqrt(1.0 + np.mean(1.0 / partners))
+
+    @property
+    def _measured_before_mm(self) -> np.ndarray:
+        """(N, n, 3) measured key points of the partner, mm; NaN where there is none."""
+        return self.found.residual_mm + self.found.predicted_mm
+
+    @cached_property
+    def _repeated(self) -> "RepeatedShare":
+        """How much of each frequency AFTER repeats."""
+        return repeated_share(self.after, self._measured_before_mm)
+
+    @cached_property
+    def _repeatability(self) -> tuple[np.ndarray, str]:
+        return _repeatability(self.earlier)
+
+    @cached_property
+    def _fast_noise_mm(self) -> np.ndarray:
+        """(n,) RMS noise of the paired difference of each key point, mm."""
+        averaging = np.nanmean(self.found.averaging) if self.paired.any() else 1.0
+        return np.sqrt(
+            np.square(self.after.noise_mm) + np.square(self.earlier.noise_mm) * averaging
+        )
 
 
 @dataclass(frozen=True)
@@ -570,7 +651,7 @@ def _partners(
         predicted[rows] += _between(before.predicted_mm, lower, between)
         seen[rows] += ok
         partners[rows] += 1
-        averaging[rows] += share**2 + (1 - share) ** 2
+        averaging[rows] += between**2 + (1 - between) ** 2
         time[rows] = np.where(np.isnan(time[rows]), at, time[rows])
         stretches.append(
             Stretch(
@@ -608,7 +689,7 @@ def paired_table(
     errors after than before: measured less the partner's residual. Rows without a partner are NaN.
     None where too few rows have one; asked: whether a minute of them is enough.
     """
-    pairs = _pairs(after, before, _partners(after, before))
+    pairs = Pairs(after, before, _partners(after, before))
     if not _enough(after, pairs, asked):
         return None, pairs
     change, noise = pairs.change_mm, pairs.noise_mm
@@ -708,45 +789,6 @@ def repeated_share(after: ResidualTable, before_mm: np.ndarray) -> RepeatedShare
     frequency = np.fft.rfftfreq(length, step)
     share[frequency <= slow] = 1.0
     return RepeatedShare(frequency, np.sqrt(share))
-
-
-def _pairs(after: ResidualTable, before: ResidualTable, found: _Found) -> Pairs:
-    """The pairs that the partners amount to; what they say about errors is of training rows."""
-    paired, training = found.partners > 0, ~after.held_out
-    measured_before = found.residual_mm + found.predicted_mm
-    correction = after.predicted_mm - found.predicted_mm
-    correction = without_noise(after, after.measured_mm - measured_before, correction)
-    change = after.measured_mm - measured_before - correction
-    noise = np.sqrt(
-        np.square(after.noise_mm)
-        + np.square(before.noise_mm) * (np.nanmean(found.averaging) if paired.any() else 1.0)
-    )
-    repeated = repeated_share(after, measured_before)
-    free = free_motion(after, measured_before, found.predicted_mm, change, repeated)
-    repeatability, source = _repeatability(before)
-    slope = slope_error(after)
-    discrepancy = paired_discrepancy(repeatability, correction[training], noise, slope)
-    # Without repeats slow noise may be as large as fast noise.
-    slow = noise if source == "noise" else np.zeros_like(noise)
-    noise = np.maximum(noise, free)
-    return Pairs(
-        before=before.names,
-        stretches=found.stretches,
-        partners=found.partners,
-        partner_t_s=found.partner_t_s,
-        after_mm=after.measured_mm,
-        before_mm=after.measured_mm - change,
-        body_mm=body_before(after, measured_before + correction, repeated),
-        correction_mm=correction,
-        repeatability_mm=repeatability,
-        source=source,
-        free_mm=free,
-        noise_mm=noise,
-        discrepancy_mm=discrepancy,
-        tolerance_mm=np.sqrt(
-            discrepancy**2 + slow**2 + (slope * rms_by_point(change[training])) ** 2
-        ),
-    )
 
 
 def without_noise(
@@ -1076,9 +1118,7 @@ def before_and_after(
     table = replace(table, jumps=body_jumps(table, own_jumps_mm(other)))
     if paired == "never":
         empty = replace(other, run=np.full(len(other.run), -1))
-        return BeforeAfter(
-            table, table, other, _pairs(table, other, _partners(table, empty)), False
-        )
+        return BeforeAfter(table, table, other, Pairs(table, other, _partners(table, empty)), False)
     found, pairs = paired_table(table, other, asked=paired == "always")
     if found is None and paired == "always":
         raise InputError(

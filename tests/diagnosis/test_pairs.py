@@ -102,6 +102,16 @@ def test_partner_is_the_measurement_at_the_matching_instant(model):
     np.testing.assert_allclose(pairs.before_mm[there][:, -1, 0], expected, atol=0.01)
 
 
+@pytest.mark.parametrize("apart", [0.0, 0.5])
+def test_the_noise_of_a_pair_is_that_of_the_measured_difference(model, apart):
+    """A partner between two samples is a mean of both, with half of the variance in the middle."""
+    motion = smooth_walk(3)
+    pairs = paired(model, made(motion, 2.0), made(motion, 1.0 - apart * PERIOD_S, seed=2)).pairs
+    change = pairs.change_mm[pairs.paired]
+    measured = np.sqrt(np.mean(np.square(change - change.mean(0)).sum(2), axis=0))
+    np.testing.assert_allclose(pairs.noise_mm, measured, rtol=0.05)
+
+
 def test_only_the_common_part_is_paired(model):
     """AFTER follows the motion of BEFORE for its second half only."""
     one, other = smooth_walk(5), smooth_walk(6)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks import elastica_cases, rig_cases
+from benchmarks import amended_cases, elastica_cases, rig_cases
 from benchmarks.amended_cases import (
     AmendedCase,
     markdown,
@@ -18,7 +18,7 @@ from benchmarks.decision.evidence_log import Labelled
 from benchmarks.decision.table import Judged
 from benchmarks.diagnosis.amend import Amended
 from benchmarks.rig_cases import Case, load_case, make_case, make_robot
-from surgisoft.diagnosis.decision import Decision, Probabilities
+from surgisoft.diagnosis.decision import Decision, Probabilities, fitted_decision
 from surgisoft.errors import InputError
 from tests.diagnosis.test_decision import GOOD
 
@@ -98,12 +98,22 @@ def test_shares_of_the_oracle():
     assert sorted(cells) == ["-", "-", "50 %", "90 %"]
 
 
-def test_the_sources_that_took_no_part_are_judged_by_the_decision_in_force():
+def test_the_sources_that_took_no_part_are_judged_by_the_decision_in_force(monkeypatch):
     found = statements("elastica_b")
     assert len(found) == 36
     assert all(one.decision.confidence <= 1.0 for one in found)
+    fitted_to = []
+
+    def kept(cases):
+        fitted_to.extend(cases)
+        return {"models": {}}
+
+    monkeypatch.setattr(amended_cases, "fit", kept)
+    monkeypatch.setattr(amended_cases, "model_of", lambda values: fitted_decision())
     asked = statements("mujoco")  # of both kinds of models those of the defaults
     assert len(asked) == 105
     assert {one.case.models for one in asked} == {"default"}
+    assert "mujoco" not in {case.source for case in fitted_to}
+    assert {"strain_rod", "own_rig"} < {case.source for case in fitted_to}
     with pytest.raises(InputError, match="no stored evidence"):
         statements("nobody")

@@ -104,7 +104,7 @@ def test_excitation_distinguishes_a_random_walk_from_a_traverse():
 
 def test_same_seed_same_weights(walks):
     train, valid, _ = walks
-    config = FitConfig(hidden=(16,), epochs=10, effects=("hysteresis",))
+    config = FitConfig(hidden=(16,), epochs=3, effects=("hysteresis",))
     one, other = (fit(train, valid, SPEC, config).model.state_dict() for _ in range(2))
     assert one.keys() == other.keys()
     assert all(torch.equal(one[name], other[name]) for name in one)

@@ -133,8 +133,8 @@ class Stretch:
 class Pairs:
     """The partners of the N rows of AFTER in BEFORE, and how well BEFORE repeats itself.
 
-    What is made of the partners is computed when it is read: where too few rows have one, nothing
-    is. What pairs say about errors is of training rows.
+    What is made of the partners is computed when it is read. What pairs say about errors is of
+    training rows.
     """
 
     after: ResidualTable
@@ -224,7 +224,7 @@ class Pairs:
         """(n,) what takes the place of the model discrepancy, mm, see `paired_discrepancy`."""
         correction = self.correction_mm[~self.after.held_out]
         noise, slope = self._fast_noise_mm, slope_error(self.after)
-        return paired_discrepancy(self.repeatability_mm, correction, noise, slope)
+        return paired_discrepancy(self._slow_mm, correction, noise, slope)
 
     @cached_property
     def tolerance_mm(self) -> np.ndarray:
@@ -239,10 +239,13 @@ class Pairs:
     def unchanged_mm(self, rows: np.ndarray) -> np.ndarray:
         """(n,) RMS paired difference of a key point, mm, over rows (N,) bool, if nothing changed.
 
-        The variance of one recording and that of a mean over k partners: repeatability^2 (1 + 1/k).
+        The noise of the pair, and the variance of what one recording and a mean over k partners
+        have beside it: slow^2 (1 + 1/k).
         """
         partners = self.partners[rows & self.paired]
-        return self.repeatability_mm * np.sqrt(1.0 + np.mean(1.0 / partners))
+        share = np.minimum(self.repeatability_mm / self.earlier.noise_mm, 1.0)
+        slow = np.square(self._slow_mm) * (1.0 + np.mean(1.0 / partners))
+        return np.sqrt(np.square(share * self._fast_noise_mm) + slow)
 
     @property
     def _measured_before_mm(self) -> np.ndarray:
@@ -257,6 +260,12 @@ class Pairs:
     @cached_property
     def _repeatability(self) -> tuple[np.ndarray, str]:
         return _repeatability(self.earlier)
+
+    @property
+    def _slow_mm(self) -> np.ndarray:
+        """(n,) what repeats of BEFORE differ by beyond their noise, RMS of one recording, mm."""
+        square = np.square(self.repeatability_mm) - np.square(self.earlier.noise_mm)
+        return np.sqrt(np.maximum(square, 0.0))
 
     @cached_property
     def _fast_noise_mm(self) -> np.ndarray:
@@ -920,10 +929,16 @@ def _enough(after: ResidualTable, pairs: Pairs, asked: bool) -> bool:
 def _repeatability(before: ResidualTable) -> tuple[np.ndarray, str]:
     """(n,) RMS distance by which a recording of the same motion differs, mm, and its source.
 
-    Two recordings of BEFORE differ by twice the variance of one. Exact repeats of a motion count;
-    where there are too few, rows that are alike, with the model's correction. Where BEFORE repeats
-    nothing, the noise floor is what is known.
+    Exact repeats of a motion in BEFORE count; where there are too few, rows that are alike, with
+    the model's correction. Where BEFORE repeats nothing, the noise floor is what is known. A row
+    and the mean of its k partners differ by the variance
+
+        noise^2 (1 + averaging) + slow^2 (1 + 1/k),
+
+    with white noise, which the interpolation of partners lowers (`_Found.averaging`), and what is
+    slower than two samples, which it does not. The repeatability is the root of noise^2 + slow^2.
     """
+    noise = np.square(before.noise_mm)
     for share in (EXACT, ALIKE):
         found = _partners(before, before, True, share)
         difference = before.measured_mm - found.residual_mm - found.predicted_mm
@@ -932,28 +947,34 @@ def _repeatability(before: ResidualTable) -> tuple[np.ndarray, str]:
         square = np.square(difference - correction).sum(2)
         # Less what an error of the model's slope does to the correction.
         square -= np.square(slope_error(before)) * np.square(correction).sum(2)
-        # A mean of several partners has less of a variance.
-        square /= 1.0 + 1.0 / np.maximum(found.partners, 1)[:, None]
-        if (np.isfinite(square).sum(0) >= 2 * LEAST_BLOCKS * BLOCK_ROWS).all():
-            mean = np.maximum(np.nanmean(square, axis=0), 0.0)
-            return np.maximum(np.sqrt(mean), NOISE_SHARE * before.noise_mm), "repeats"
+        seen = np.isfinite(square)
+        if (seen.sum(0) >= 2 * LEAST_BLOCKS * BLOCK_ROWS).all():
+            some = seen.any(1)
+            white = 1.0 + float(np.mean(found.averaging[some]))
+            whole = 1.0 + float(np.mean(1.0 / found.partners[some]))
+            mean = np.nanmean(square, axis=0)
+            slow = (mean - white * noise) / whole
+            # The noise floor may be stated too large.
+            variance = np.where(slow >= 0.0, noise + slow, np.maximum(mean, 0.0) / white)
+            return np.maximum(np.sqrt(variance), NOISE_SHARE * before.noise_mm), "repeats"
     return before.noise_mm, "noise"
 
 
 def paired_discrepancy(
-    repeatability_mm: np.ndarray, correction_mm: np.ndarray, noise_mm: np.ndarray, slope: float
+    slow_mm: np.ndarray, correction_mm: np.ndarray, noise_mm: np.ndarray, slope: float
 ) -> np.ndarray:
     """(n,) RMS systematic error of the paired difference of each key point, mm, without noise.
 
-    What BEFORE does not repeat, without the noise of the pair (`noise_mm`), and the error of the
-    correction for the actuation, of which the model's slope is off by a share (`slope`):
+    What two recordings differ by beyond the noise, the square of which is twice that of one
+    (`slow_mm`), and the error of the correction for the actuation, of which the model's slope is
+    off by a share (`slope`):
 
-        discrepancy^2 = max(2 repeatability^2 - noise^2, (least noise)^2) + (slope correction)^2.
+        discrepancy^2 = max(2 slow^2, (least noise)^2) + (slope correction)^2.
 
     It takes the place of the model discrepancy, in its size and its form: a smooth function of the
     actuation that is the same in every repeat.
     """
-    slow = np.maximum(2 * repeatability_mm**2 - noise_mm**2, (LEAST_DISCREPANCY * noise_mm) ** 2)
+    slow = np.maximum(2 * slow_mm**2, (LEAST_DISCREPANCY * noise_mm) ** 2)
     return np.sqrt(slow + (slope * rms_by_point(correction_mm)) ** 2)
 
 

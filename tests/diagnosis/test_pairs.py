@@ -149,6 +149,22 @@ def test_repeated_runs_of_before_are_averaged_and_show_its_repeatability(model):
     assert unchanged == pytest.approx(np.sqrt(1.25) * several.repeatability_mm)
 
 
+@pytest.mark.parametrize(("repeat", "apart"), [(0.5, 0.0), (0.0, 0.5), (0.5, 0.5)])
+def test_an_unchanged_arm_whose_samples_lie_between_those_before_is_unchanged(model, repeat, apart):
+    """White noise alone, whatever part of a sample repeats of BEFORE and AFTER are shifted by."""
+    motion = smooth_walk(7)
+    before = [
+        made(motion, 1.0 - shift * PERIOD_S, seed=k, name=f"take{k}")
+        for k, shift in ((2, 0.0), (3, repeat))
+    ]
+    after = made(motion, 2.0 - apart * PERIOD_S)
+    both = before_and_after(residual_table(model, [after]), before)
+    assert both.change.repeatability_source == "repeats"
+    assert both.pairs.repeatability_mm == pytest.approx(np.sqrt(3) * NOISE_MM, rel=0.05)
+    assert both.change.change_mm == pytest.approx(both.change.unchanged_mm, rel=0.06)
+    assert both.pairs.discrepancy_mm.max() < 0.5 * both.pairs.noise_mm.min()
+
+
 def test_the_change_of_an_unchanged_arm_is_the_one_that_is_printed_beside_it(model):
     """A second recording of the same motion with the same noise, and nothing else."""
     motion = smooth_walk(7)

@@ -148,7 +148,9 @@ def _opened(
     after = json.loads((place / "truth.json").read_text())["after"]
     model = load_model(model_folder(folder, case.robot, models, models=case.models))
     recording = load_recordings(place / "after")[0]
-    return model, recording, unchanged(generator, case, after)
+    about = json.loads((robot_folder(folder, case.robot) / "robot.json").read_text())
+    as_long = dataclasses.replace(generator, longer=about.get("longer", 1.0))
+    return model, recording, unchanged(as_long, case, after)
 
 
 def markdown(some: dict[str, list[AmendedCase]]) -> str:

@@ -13,7 +13,8 @@ Everything follows from the seeds, and what exists already is kept: a second cal
 cases come in rounds that hold every known effect, unknown ones, pairs and clean robots, so that any
 first part of them is balanced. `--pairs` and `--unknown` add cases of two effects, any two of the
 list that recordings can tell apart, and of unknown effects of more kinds; they have plans of their
-own, so that the rounds stay what they are. Strengths are chosen so that the RMS change is about the
+own, so that the rounds stay what they are. `--longer` is a factor on the durations of all
+recordings. Strengths are chosen so that the RMS change is about the
 one drawn. Nothing here knows a model or a diagnosis. `benchmarks.elastica_cases` and
 `benchmarks.chain_cases` are two generators.
 """
@@ -255,6 +256,12 @@ def make_robot(generator: Generator, folder: Path, robot: int) -> None:
     """Record a robot before any change, and what it would do in the protocols after it."""
     place = folder / "robots" / str(robot)
     if (place / "robot.json").is_file():
+        known = json.loads((place / "robot.json").read_text()).get("longer", 1.0)
+        if known != generator.longer:
+            raise InputError(
+                f"{place}: its recordings were made with --longer {known:g}, expected "
+                f"{generator.longer:g}; take another folder, or the same factor"
+            )
         return
     (place / "before").mkdir(parents=True, exist_ok=True)
     plain = {}
@@ -284,7 +291,12 @@ def make_robot(generator: Generator, folder: Path, robot: int) -> None:
         "period_s": rig.period_s,
         "noise_mm": noise,
     }
-    _write(place / "robot.json", about | generator.about(robot))
+    _write(place / "robot.json", about | _lengthened(generator) | generator.about(robot))
+
+
+def _lengthened(generator: Generator) -> dict[str, float]:
+    """The factor on the durations for `robot.json`; nothing where it is 1."""
+    return {} if generator.longer == 1.0 else {"longer": generator.longer}
 
 
 def change_mm(points: np.ndarray, plain: np.ndarray) -> float:
@@ -404,10 +416,13 @@ def main(generator: Generator, about: str, robots: str) -> None:
     parser.add_argument("--count", type=int, default=100, help="cases of the rounds")
     parser.add_argument("--pairs", type=int, default=0, help="further cases of two effects")
     parser.add_argument("--unknown", type=int, default=0, help="further cases of unknown effects")
-    parser.add_argument("--longer", type=float, default=1.0, help="factor on all durations")
+    longer = "factor on the durations of the recordings"
+    parser.add_argument("--longer", type=float, default=1.0, help=longer)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--processes", type=int, default=1)
     given = parser.parse_args()
+    if not given.longer > 0.0:
+        parser.error(f"--longer {given.longer:g}: expected a factor above 0")
     generator = replace(generator, longer=given.longer)
     seeds = [int(word) for word in given.robots.split(",")]
     drawn = [
@@ -416,4 +431,7 @@ def main(generator: Generator, about: str, robots: str) -> None:
         *unknowns(generator, seeds, given.unknown, given.seed),
     ]
     report = functools.partial(print, flush=True)
-    run(generator, given.folder, seeds, drawn, given.processes, report)
+    try:
+        run(generator, given.folder, seeds, drawn, given.processes, report)
+    except InputError as error:
+        parser.error(str(error))

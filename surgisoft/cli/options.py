@@ -68,7 +68,8 @@ Paired = Annotated[
     Option(
         metavar="auto|always|never",
         help="Whether rows of the same actuation before and after are paired: 'auto' if at least "
-        "half of them can be, 'always' if a minute of them can be, and it is an error otherwise.",
+        "half can be; 'always' also if fewer can be, for a minute in all, and an error otherwise; "
+        "'never' not at all.",
     ),
 ]
 NewModel = Annotated[Path, Option("-o", "--output", metavar="NEW", help="Folder of the new model.")]

@@ -221,14 +221,15 @@ class Amendment:
         if not self.retuned:
             return text
         # The held-out rows choose nothing, so the layer stays where it errs more on them.
-        less = self.alone.after < self.held_out.after
-        keep = ", less here: --keep-network leaves the layer as it was" if less else ""
+        more = round(self.alone.after, 3) < round(self.held_out.after, 3)
         if not self.claimed:
-            text += f"; {self.held_out.after:.3f} mm with the network's last layer re-tuned"
-            return text + (keep and f", and {self.alone.after:.3f} mm without that{keep}")
+            than = ", more than without that" if more else ""
+            tuned = f"{self.held_out.after:.3f} mm with the network's last layer re-tuned"
+            return f"{text}; {tuned}{than}"
+        lower = ", which is lower on these rows" if more else ""
         return (
             f"{' + '.join(self.effects)}: {self.held_out.sentence}, with the network's last layer "
-            f"re-tuned; {self.alone.after:.3f} mm with the effects alone{keep}"
+            f"re-tuned; {self.alone.after:.3f} mm with the effects alone{lower}"
         )
 
     @property

@@ -93,8 +93,11 @@ LEAST_SHARE = 0.5
 """Share of the training rows of AFTER that must have a partner for the paired difference to be
 used: it says nothing of the other rows. Two schedules of ten minutes that were drawn by chance have
 minutes of rest and of equal ramps in common, which need not show what changed."""
+LEAST_ROWS = 2 * LEAST_BLOCKS * BLOCK_ROWS
+"""Fewest rows with a partner, in any case."""
 LEAST_S = 60.0
-"""Time with a partner from which fewer do where pairs are asked for (`--paired always`), s."""
+"""Time with a partner that suffices although fewer rows have one, where pairs are asked for
+(`--paired always`), s."""
 SPECTRUM_S = 20.0
 """Longest stretch of a power spectrum, s: four blocks of time."""
 FREE_POWER = 4.0
@@ -600,6 +603,13 @@ class _Found:
     """(N,) factor on the variance of BEFORE's noise, by interpolation and by averaging."""
     stretches: tuple[Stretch, ...]
 
+    @classmethod
+    def none(cls, after: ResidualTable) -> "_Found":
+        """No partner for any row."""
+        nothing = np.full(after.measured_mm.shape, np.nan)
+        never = np.full(len(nothing), np.nan)
+        return cls(nothing, nothing, np.zeros(len(nothing), int), never, never, ())
+
 
 def _alike(
     after: ResidualTable, before: ResidualTable, commanded: bool, share: float = ALIKE
@@ -916,7 +926,7 @@ def _enough(after: ResidualTable, pairs: Pairs, asked: bool) -> bool:
     """
     shown = np.isfinite(after.measured_mm).all(2).any(1) & ~after.held_out
     both = shown & np.isfinite(pairs.change_mm).all(2).any(1)
-    if both.sum() < 2 * LEAST_BLOCKS * BLOCK_ROWS:
+    if both.sum() < LEAST_ROWS:
         return False
     if both.sum() >= LEAST_SHARE * shown.sum():
         return True
@@ -948,7 +958,7 @@ def _repeatability(before: ResidualTable) -> tuple[np.ndarray, str]:
         # Less what an error of the model's slope does to the correction.
         square -= np.square(slope_error(before)) * np.square(correction).sum(2)
         seen = np.isfinite(square)
-        if (seen.sum(0) >= 2 * LEAST_BLOCKS * BLOCK_ROWS).all():
+        if (seen.sum(0) >= LEAST_ROWS).all():
             some = seen.any(1)
             white = 1.0 + float(np.mean(found.averaging[some]))
             whole = 1.0 + float(np.mean(1.0 / found.partners[some]))
@@ -1004,8 +1014,8 @@ def slope_error(table: ResidualTable) -> float:
 # Before and after ----------------------------------------------------------------------------
 
 Paired = str
-"""Whether rows are paired: where half of them have a partner, or where a minute of them has, else
-it is an error, or not at all."""
+"""Whether rows are paired: `auto` where at least half of them have a partner, `always` also where
+fewer have one, for a minute in all, and with an error otherwise, `never` not at all."""
 PAIRED: tuple[Paired, ...] = ("auto", "always", "never")
 
 
@@ -1023,6 +1033,11 @@ class BeforeAfter:
     """The partners of the rows of AFTER."""
     used: bool
     """Whether the paired difference is what is explained."""
+    asked: Paired = "auto"
+    """What was asked for."""
+    unchecked: bool = False
+    """Whether the paired difference is left aside because a final check could not see it: too few
+    of the held-out rows have a partner."""
 
     @property
     def names(self) -> str:
@@ -1070,9 +1085,12 @@ class BeforeAfter:
         )
 
     def with_final_check(self) -> "BeforeAfter":
-        """The same, unpaired where too few held-out rows have a partner for a final check."""
-        if self.used and self.pairs.paired[self.plain.held_out].mean() < LEAST_SHARE:
-            return replace(self, table=self.plain, used=False)
+        """The same, unpaired where too few held-out rows have a partner for a final check: fewer
+        than half, or where pairs are asked for (`--paired always`) fewer than a fit takes."""
+        there = self.pairs.paired[self.plain.held_out]
+        least = LEAST_ROWS if self.asked == "always" else LEAST_SHARE * len(there)
+        if self.used and there.sum() < least:
+            return replace(self, table=self.plain, used=False, unchecked=True)
         return self
 
     @cached_property
@@ -1116,13 +1134,20 @@ class BeforeAfter:
             return (self.strange_in_words,)
         if self.used:
             return ()
+        if self.asked == "never":
+            return (f"rows are not paired, as --paired never asks: {instead}",)
+        same = f"were recorded with the same actuation as {self.names}"
+        again = "record the same protocol before and after"
+        if self.unchecked:
+            share = float(self.pairs.paired[self.plain.held_out].mean())
+            return (
+                f"{100 * share:.0f} % of the held-out rows {same}, too few to check an amendment "
+                f"of the change on them: {instead}; {again}",
+            )
         share = float(self.pairs.paired[~self.table.held_out].mean())
         few = _enough(self.plain, self.pairs, asked=True)
         alone = ", or explain the change in these rows alone by --paired always" if few else ""
-        return (
-            f"{100 * share:.0f} % of the rows were recorded with the same actuation as "
-            f"{self.names}: {instead}; record the same protocol before and after{alone}",
-        )
+        return (f"{100 * share:.0f} % of the rows {same}: {instead}; {again}{alone}",)
 
 
 def before_and_after(
@@ -1138,16 +1163,18 @@ def before_and_after(
     _check_common_range(table, other)
     table = replace(table, jumps=body_jumps(table, own_jumps_mm(other)))
     if paired == "never":
-        empty = replace(other, run=np.full(len(other.run), -1))
-        return BeforeAfter(table, table, other, Pairs(table, other, _partners(table, empty)), False)
+        none = Pairs(table, other, _Found.none(table))
+        return BeforeAfter(table, table, other, none, False, paired)
     found, pairs = paired_table(table, other, asked=paired == "always")
     if found is None and paired == "always":
+        share = pairs.paired[~table.held_out].mean()
         raise InputError(
-            f"{' + '.join(table.names)}: only {100 * pairs.paired.mean():.0f} % of the rows were "
-            f"recorded with the same actuation as {' + '.join(pairs.before)}; record the same "
-            "protocol before and after, or leave out --paired always"
+            f"{' + '.join(table.names)}: only {100 * share:.0f} % of the rows were recorded with "
+            f"the same actuation as {' + '.join(pairs.before)}, expected half of them, or "
+            f"{LEAST_S:g} s; record the same protocol before and after, or leave out "
+            "--paired always"
         )
-    return BeforeAfter(found or table, table, other, pairs, found is not None)
+    return BeforeAfter(found or table, table, other, pairs, found is not None, paired)
 
 
 def _check_common_range(after: ResidualTable, before: ResidualTable) -> None:

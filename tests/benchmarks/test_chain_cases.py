@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -37,6 +38,7 @@ from benchmarks.rig_cases import (
 from benchmarks.rig_cases import (
     make_robot as record_robot,
 )
+from surgisoft.errors import InputError
 
 PLAIN = Wall(0.05, np.zeros(2), np.zeros(2), 0.0, 0.0, np.array([0.0, 0.5]))
 """A linear wall."""
@@ -214,6 +216,19 @@ def test_a_case_changes_as_much_as_is_drawn(tmp_path):
     noise = math.sqrt(6.0) * truth["noise_mm"]
     found = math.sqrt(np.nanmean(change**2) - noise**2)
     assert found == pytest.approx(truth["change_rms_mm"], rel=0.1)
+
+
+def test_recordings_are_longer_by_the_factor_and_of_one_factor_in_a_folder(tmp_path):
+    """A quarter of the durations: 150 s after a change, and those of the build before it."""
+    short = replace(GENERATOR, longer=0.25)
+    record_robot(short, tmp_path, 601)
+    make_case(short, tmp_path, Case(0, 601, (), 1.0, "brisk"))
+    _, before, after = load_case(tmp_path, "000")
+    lasts = [each.samples * np.median(np.diff(each.t_s)) for each in (*after, *before)]
+    whole = [150.0, *GENERATOR.before_s(601).values()]
+    assert sorted(lasts) == pytest.approx(sorted(0.25 * each for each in whole), rel=0.03)
+    with pytest.raises(InputError, match=r"made with --longer 0\.25, expected 1"):
+        record_robot(GENERATOR, tmp_path, 601)
 
 
 def test_a_robot_states_the_budget_of_its_fit(tmp_path, monkeypatch):

@@ -343,6 +343,50 @@ def test_a_minute_of_pairs_is_explained_only_where_pairs_are_asked_for(model):
     assert "--paired always" not in short.notes[0]
 
 
+def test_nothing_is_paired_where_pairs_are_not_wanted(model):
+    table = residual_table(model, [made(smooth_walk(3), 0.0)])
+    both = before_and_after(table, [made(smooth_walk(3), 0.0, seed=2, name="earlier")], "never")
+    assert not both.pairs.paired.any()
+    assert both.change.paired_share == 0.0
+    (note,) = both.notes
+    assert "as --paired never asks" in note
+    assert "record" not in note
+
+
+def test_an_amendment_of_few_pairs_is_checked_where_they_are_asked_for(model):
+    """One of three recordings repeats BEFORE: a third of the held-out rows has a partner."""
+    motion, rows = smooth_walk(3), round(120.0 / PERIOD_S)
+    before = made(motion, 0.0, rows=rows, seed=9, name="earlier")
+    turned = [
+        made(each, 0.0, rows=rows, seed=k, name=f"new{k}", change=lambda p: 0.5 + 0.0 * p[:, 0])
+        for k, each in enumerate((motion, smooth_walk(11), smooth_walk(12)))
+    ]
+    settings = {"before": [before], "retune_network": False, "refit": "never"}
+    asked = amend(model, turned, "misalignment", paired="always", **settings)
+    assert asked.model_error is not None
+    assert asked.claimed
+    assert asked.notes == ()
+    plain = amend(model, turned, "misalignment", **settings)
+    assert plain.model_error is None
+
+
+def test_held_out_rows_without_partners_are_the_reason_that_is_given(model):
+    """The first three quarters repeat BEFORE, the held-out quarter does not."""
+    motion, other, part = smooth_walk(3), smooth_walk(11), 0.75 * ROWS * PERIOD_S
+
+    def turning_off(t_s):
+        return np.where((t_s < part)[:, None], motion(t_s), other(t_s))
+
+    table = residual_table(model, [made(turning_off, 0.0)])
+    both = before_and_after(table, [made(motion, 0.0, seed=2, name="earlier")])
+    assert both.used
+    checked = both.with_final_check()
+    assert not checked.used
+    (note,) = checked.notes_of_fit
+    assert note.startswith("0 % of the held-out rows were recorded with the same actuation as ear")
+    assert "--paired always" not in note
+
+
 def test_an_effect_that_is_fitted_without_pairs_is_said_to_be_fitted_as_without_before(model):
     after, before = made(smooth_walk(10), 1.0), made(smooth_walk(11), 0.0, seed=2, name="other")
     settings = {"retune_network": False, "refit": "never"}

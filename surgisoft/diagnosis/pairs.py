@@ -311,10 +311,11 @@ class Change:
         """The change in words."""
         names = " + ".join(self.before)
         if self.change_mm is None:
-            return (
-                f"no actuation in common with {names}: the model's residuals are compared with its "
-                "residuals there"
-            )
+            few = f"{100 * self.paired_share:.0f} %"
+            paired = f"no rows are paired with {names}"
+            if few != "0 %":
+                paired = f"only {few} of the rows have the same actuation as {names}"
+            return f"{paired}: the model's residuals are compared with its residuals there"
         delays = sorted({f"{each.delay_s:z.2f} s" for each in self.stretches[:DELAYS_SHOWN]})
         return (
             f"{100 * self.paired_share:.0f} % of the rows are paired with {names} (delay "

@@ -337,6 +337,7 @@ def test_a_minute_of_pairs_is_explained_only_where_pairs_are_asked_for(model):
     table = residual_table(model, [made(motion, 0.0, rows=rows), *after])
     found = before_and_after(table, [before])
     assert not found.used
+    assert found.change.sentence.startswith("only 33 % of the rows have the same actuation as ear")
     assert "by --paired always" in found.notes[0]
     assert before_and_after(table, [before], "always").used
     short = before_and_after(residual_table(model, after), [before])
@@ -348,6 +349,7 @@ def test_nothing_is_paired_where_pairs_are_not_wanted(model):
     both = before_and_after(table, [made(smooth_walk(3), 0.0, seed=2, name="earlier")], "never")
     assert not both.pairs.paired.any()
     assert both.change.paired_share == 0.0
+    assert both.change.sentence.startswith("no rows are paired with earlier: the model's residuals")
     (note,) = both.notes
     assert "as --paired never asks" in note
     assert "record" not in note

@@ -1130,11 +1130,18 @@ class BeforeAfter:
         )
 
     def _limits(self, instead: str) -> tuple[str, ...]:
-        """Why rows are not paired, and what is done instead; empty where they are."""
+        """Why rows are not paired, and what is done instead, or that most of them are not looked
+        at; empty where they are paired."""
         if self.strange is not None:
             return (self.strange_in_words,)
         if self.used:
-            return ()
+            alone = 1.0 - float(self.pairs.paired[~self.table.held_out].mean())
+            if alone <= 1.0 - LEAST_SHARE:
+                return ()
+            return (
+                f"{100 * alone:.0f} % of the rows have no partner in {self.names}: what changed "
+                "there is not looked at; --paired auto looks at all rows by the model's residuals",
+            )
         if self.asked == "never":
             return (f"rows are not paired, as --paired never asks: {instead}",)
         same = f"were recorded with the same actuation as {self.names}"

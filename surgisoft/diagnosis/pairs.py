@@ -1135,11 +1135,11 @@ class BeforeAfter:
         if self.strange is not None:
             return (self.strange_in_words,)
         if self.used:
-            alone = 1.0 - float(self.pairs.paired[~self.table.held_out].mean())
-            if alone <= 1.0 - LEAST_SHARE:
+            left_out = 1.0 - float(self.pairs.paired[~self.table.held_out].mean())
+            if left_out <= 1.0 - LEAST_SHARE:
                 return ()
             return (
-                f"{100 * alone:.0f} % of the rows have no partner in {self.names}: what changed "
+                f"{100 * left_out:.0f} % of the rows have no partner in {self.names}: what changed "
                 "there is not looked at; --paired auto looks at all rows by the model's residuals",
             )
         if self.asked == "never":

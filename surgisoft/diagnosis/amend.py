@@ -223,7 +223,7 @@ class Amendment:
         # The held-out rows choose nothing, so the layer stays where it errs more on them.
         more = round(self.alone.after, 3) < round(self.held_out.after, 3)
         if not self.claimed:
-            than = ", more than without that" if more else ""
+            than = ", more than with the effects alone" if more else ""
             tuned = f"{self.held_out.after:.3f} mm with the network's last layer re-tuned"
             return f"{text}; {tuned}{than}"
         lower = ", which is lower on these rows" if more else ""

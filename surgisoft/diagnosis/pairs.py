@@ -1136,14 +1136,15 @@ class BeforeAfter:
             return (self.strange_in_words,)
         if self.used:
             left_out = 1.0 - float(self.pairs.paired[~self.table.held_out].mean())
-            if left_out <= 1.0 - LEAST_SHARE:
+            if self.asked != "always" or left_out <= 1.0 - LEAST_SHARE:
                 return ()
             return (
-                f"{100 * left_out:.0f} % of the rows have no partner in {self.names}: what changed "
-                "there is not looked at; --paired auto looks at all rows by the model's residuals",
+                f"{100 * left_out:.0f} % of the rows have no partner in {self.names}, and what "
+                "changed there is not explained; --paired auto explains the model's residuals on "
+                "all rows",
             )
         if self.asked == "never":
-            return (f"rows are not paired, as --paired never asks: {instead}",)
+            return (f"rows are not paired, because --paired never was given: {instead}",)
         same = f"were recorded with the same actuation as {self.names}"
         again = "record the same protocol before and after"
         if self.unchecked:

@@ -351,7 +351,7 @@ def test_nothing_is_paired_where_pairs_are_not_wanted(model):
     assert both.change.paired_share == 0.0
     assert both.change.sentence.startswith("no rows are paired with earlier: the model's residuals")
     (note,) = both.notes
-    assert "as --paired never asks" in note
+    assert "because --paired never was given" in note
     assert "record" not in note
 
 
@@ -368,7 +368,7 @@ def test_an_amendment_of_few_pairs_is_checked_where_they_are_asked_for(model):
     assert asked.model_error is not None
     assert asked.claimed
     (note,) = asked.notes
-    assert note.startswith("67 % of the rows have no partner in earlier: what changed there is not")
+    assert note.startswith("67 % of the rows have no partner in earlier, and what changed there is")
     plain = amend(model, turned, "misalignment", **settings)
     assert plain.model_error is None
 

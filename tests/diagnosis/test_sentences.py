@@ -75,7 +75,7 @@ NUMBERS = "0.500 to 0.200 mm on held-out data (fall 0.300 mm, 95 % 0.100 to 0.40
         ),
         (
             {"retuned": True, "held_out": fall(0.5, 0.25, ci95=(-0.1, 0.4))},
-            "; 0.250 mm with the network's last layer re-tuned, more than without that",
+            "; 0.250 mm with the network's last layer re-tuned, more than with the effects alone",
         ),
         (
             {"alone": fall(ci95=(-0.1, 0.4))},

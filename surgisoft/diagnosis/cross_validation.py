@@ -136,6 +136,11 @@ class Split:
         """Number of rows that are held out in turn."""
         return len(self.order)
 
+    def by_fold(self, products: np.ndarray) -> np.ndarray:
+        """(..., folds) sums of products (..., B) of the blocks that are held out."""
+        owner = self.fold[:, None] == np.arange(len(self.held))
+        return products @ owner.astype(products.dtype)
+
     def laid_out(self, given: Sequence[np.ndarray], room: int = 0) -> np.ndarray:
         """(rows, n, 3, room + K) fields (rows, n, 3, k) side by side, in this order.
 
@@ -265,10 +270,14 @@ class CrossValidation:
     """(L, folds, 1 + K, 1 + K) products of them over the fitted rows, static part out."""
     held_out: "HeldOut"
     """The same of what the static part leaves on each held-out block."""
+    by_fold: "HeldOut"
+    """Sums of `held_out` over the blocks of each fold."""
     turned: list[np.ndarray]
     """For each fold (F, n, 3, 1 + K) products of the static part's basis and `fields`."""
-    cache: dict = field(default_factory=dict)
-    """Held-out sums of squares and amplitudes by sensitivities."""
+    solved: dict = field(default_factory=dict)
+    """Held-out sums of squares and amplitudes with every ridge, by sensitivities."""
+    best: dict = field(default_factory=dict)
+    """Held-out sums of squares of each block with the best ridges, by sensitivities."""
 
     @classmethod
     def on(
@@ -283,8 +292,9 @@ class CrossValidation:
         turned = split.turned(both, known)
         grams, lines = _products(split, both, turned)
         grams[:, :, 0, 0] += np.square(known, dtype=float).sum()
-        none = np.empty((len(lines), both.shape[3], 0, lines.shape[2]), np.float32)
-        return cls(split, (both,), grams, HeldOut(lines, none), turned)
+        held_out = HeldOut.of(lines, both.shape[3])
+        by_fold = HeldOut.of(split.by_fold(lines), both.shape[3])
+        return cls(split, (both,), grams, held_out, by_fold, turned)
 
     def extended(self, sensitivities: np.ndarray) -> "CrossValidation":
         """This cross-validation with further sensitivities (rows, n, 3, K') after its own."""
@@ -295,7 +305,14 @@ class CrossValidation:
         grams, border = _products_with(self.split, fields, whole, more, turned)
         grams = _bordered(self.grams, grams)
         return CrossValidation(
-            self.split, fields, grams, self.held_out.extended(border), whole, dict(self.cache)
+            self.split,
+            fields,
+            grams,
+            self.held_out.extended(border),
+            self.by_fold.extended(self.split.by_fold(border)),
+            whole,
+            dict(self.solved),
+            dict(self.best),
         )
 
     def level_losses(self) -> np.ndarray:
@@ -317,10 +334,15 @@ class CrossValidation:
     def losses(self, chosen: Sequence[int] | np.ndarray = ()) -> np.ndarray:
         """(B,) held-out sum of squared distances of each block with chosen sensitivities, mm^2."""
         sensitivities = _rising(chosen)
-        tried, _ = self._solved(sensitivities)
-        ridges = len(RIDGES) if len(sensitivities) > 1 else 1
-        tried = tried[:, :ridges].reshape(-1, tried.shape[2])
-        return tried[tried.sum(axis=1).argmin()]
+        key = sensitivities.tobytes()
+        if key not in self.best:
+            sums, amplitudes = self._solved(sensitivities)
+            ridges = len(RIDGES) if len(sensitivities) > 1 else 1
+            level, ridge = np.unravel_index(sums[:, :ridges].argmin(), (len(sums), ridges))
+            some = amplitudes[level, ridge][None, None]
+            losses = self._sums(self.held_out, sensitivities, some, self.split.fold, int(level))
+            self.best[key] = losses[0, 0]
+        return self.best[key]
 
     def amplitudes(self, chosen: list[int] | tuple[int, ...] | np.ndarray) -> np.ndarray:
         """(k,) amplitudes of the chosen sensitivities, mean over the folds."""
@@ -345,26 +367,42 @@ class CrossValidation:
         """(k,) amplitudes of the chosen sensitivities, mean over the folds, and their level."""
         sensitivities = _rising(chosen)
         where = np.searchsorted(sensitivities, chosen)
-        tried, amplitudes = self._solved(sensitivities)
-        sums = tried.sum(axis=2)
+        sums, amplitudes = self._solved(sensitivities)
         level, ridge = np.unravel_index(sums.argmin(), sums.shape)
         return amplitudes[level, ridge].mean(axis=0)[where], int(level)
 
     def _solved(self, sensitivities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """((L, r, B) held-out sums of squares, (L, r, folds, k) amplitudes) for every ridge."""
+        """((L, r) held-out sums of squares, (L, r, folds, k) amplitudes) for every ridge.
+
+        Amplitudes are the same in all blocks of a fold, so that its products are added up first:
+        the blocks are looked at for the best ridges alone.
+        """
         key = sensitivities.tobytes()
-        if key not in self.cache:
-            rows = np.concatenate([[0], sensitivities + 1])
+        if key not in self.solved:
             levels, folds = self.grams.shape[:2]
             amplitudes = np.empty((levels, len(RIDGES), folds, len(sensitivities)))
-            _solve(self.grams, rows, np.array(RIDGES), amplitudes)
-            losses = np.empty((levels, len(RIDGES), len(self.split.fold)))
-            products = self.held_out
-            _sum_squares(
-                products.first, products.further, rows, amplitudes, self.split.fold, losses
-            )
-            self.cache[key] = losses, amplitudes
-        return self.cache[key]
+            _solve(self.grams, np.append(0, sensitivities + 1), np.array(RIDGES), amplitudes)
+            sums = self._sums(self.by_fold, sensitivities, amplitudes, np.arange(folds))
+            self.solved[key] = sums.sum(axis=2), amplitudes
+        return self.solved[key]
+
+    def _sums(
+        self,
+        products: "HeldOut",
+        sensitivities: np.ndarray,
+        amplitudes: np.ndarray,
+        fold: np.ndarray,
+        level: int = 0,
+    ) -> np.ndarray:
+        """(L, r, B) held-out sums of squares at amplitudes (L, r, folds, k) from a level on.
+
+        products: of B blocks, fold (B,) their folds; or of the folds.
+        """
+        losses = np.empty((*amplitudes.shape[:2], len(fold)))
+        rows = np.append(0, sensitivities + 1)
+        some = slice(level, level + len(amplitudes))
+        _sum_squares(products.first[some], products.further[some], rows, amplitudes, fold, losses)
+        return losses
 
 
 @dataclass(frozen=True, eq=False)
@@ -380,6 +418,11 @@ class HeldOut:
     i (i + 1) / 2 + j."""
     further: np.ndarray
     """(L, C + A, A, B) of all columns with A columns that were added."""
+
+    @classmethod
+    def of(cls, lines: np.ndarray, columns: int) -> "HeldOut":
+        """The products (L, C (C + 1) / 2, B) of C columns."""
+        return cls(lines, np.empty((len(lines), columns, 0, lines.shape[2]), np.float32))
 
     @property
     def columns(self) -> int:

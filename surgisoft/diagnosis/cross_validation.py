@@ -29,6 +29,8 @@ PERSISTENCE = (5.0, 50.0, 500.0)
 """Rows over which the remaining error is correlated: it holds the discrepancy back so many times
 more than white noise of its size. The one that does best on held-out blocks is taken."""
 
+LARGE = 48
+"""Number of sensitivities from which what many sets have in common is factorised once for all."""
 STRIP = 1 << 20
 """Numbers of a field that are worked through at once: 4 MB, of which the cache holds a few."""
 REFERENCE_WEIGHT = 3.0
@@ -278,6 +280,8 @@ class CrossValidation:
     """Held-out sums of squares and amplitudes with every ridge, by sensitivities."""
     best: dict = field(default_factory=dict)
     """Held-out sums of squares of each block with the best ridges, by sensitivities."""
+    factors: dict = field(default_factory=dict)
+    """Factors of the normal matrices of what many sets have in common (`_solve`)."""
 
     @classmethod
     def on(
@@ -313,6 +317,7 @@ class CrossValidation:
             whole,
             dict(self.solved),
             dict(self.best),
+            dict(self.factors),
         )
 
     def level_losses(self) -> np.ndarray:
@@ -331,12 +336,18 @@ class CrossValidation:
         weights = self.split.seen[:rows].sum(1)
         return np.bincount(self.split.block[:rows], weights, minlength=len(self.split.fold))
 
-    def losses(self, chosen: Sequence[int] | np.ndarray = ()) -> np.ndarray:
-        """(B,) held-out sum of squared distances of each block with chosen sensitivities, mm^2."""
+    def losses(
+        self, chosen: Sequence[int] | np.ndarray = (), common: Sequence[int] = ()
+    ) -> np.ndarray:
+        """(B,) held-out sum of squared distances of each block with chosen sensitivities, mm^2.
+
+        common: those of them that other sets have, too. Where they are many (LARGE), the fit to
+        them is kept, and a set that adds few takes a small part of the time.
+        """
         sensitivities = _rising(chosen)
         key = sensitivities.tobytes()
         if key not in self.best:
-            sums, amplitudes = self._solved(sensitivities)
+            sums, amplitudes = self._solved(sensitivities, common)
             ridges = len(RIDGES) if len(sensitivities) > 1 else 1
             level, ridge = np.unravel_index(sums[:, :ridges].argmin(), (len(sums), ridges))
             some = amplitudes[level, ridge][None, None]
@@ -371,7 +382,9 @@ class CrossValidation:
         level, ridge = np.unravel_index(sums.argmin(), sums.shape)
         return amplitudes[level, ridge].mean(axis=0)[where], int(level)
 
-    def _solved(self, sensitivities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _solved(
+        self, sensitivities: np.ndarray, common: Sequence[int] = ()
+    ) -> tuple[np.ndarray, np.ndarray]:
         """((L, r) held-out sums of squares, (L, r, folds, k) amplitudes) for every ridge.
 
         Amplitudes are the same in all blocks of a fold, so that its products are added up first:
@@ -379,12 +392,33 @@ class CrossValidation:
         """
         key = sensitivities.tobytes()
         if key not in self.solved:
-            levels, folds = self.grams.shape[:2]
-            amplitudes = np.empty((levels, len(RIDGES), folds, len(sensitivities)))
-            _solve(self.grams, np.append(0, sensitivities + 1), np.array(RIDGES), amplitudes)
-            sums = self._sums(self.by_fold, sensitivities, amplitudes, np.arange(folds))
+            known = _rising(common if len(common) >= LARGE else ())
+            order = np.concatenate([known, np.setdiff1d(sensitivities, known)])
+            none = np.empty((*self.grams.shape[:2], len(RIDGES), 0, 0))
+            found = self._amplitudes(order, self._factors(known), none)
+            amplitudes = np.ascontiguousarray(found[..., np.argsort(order)])
+            folds = np.arange(len(self.split.held))
+            sums = self._sums(self.by_fold, sensitivities, amplitudes, folds)
             self.solved[key] = sums.sum(axis=2), amplitudes
         return self.solved[key]
+
+    def _factors(self, common: np.ndarray) -> np.ndarray:
+        """(L, folds, r, c, c + 1) factors of the normal matrices of c sensitivities."""
+        key, count = common.tobytes(), len(common)
+        if key not in self.factors:
+            levels, folds = self.grams.shape[:2]
+            none = np.empty((levels, folds, len(RIDGES), 0, 1))
+            kept = np.empty((levels, folds, len(RIDGES), count, count + 1))
+            self._amplitudes(common, none, kept)
+            self.factors[key] = kept
+        return self.factors[key]
+
+    def _amplitudes(self, order: np.ndarray, known: np.ndarray, kept: np.ndarray) -> np.ndarray:
+        """(L, r, folds, k) amplitudes of sensitivities in an order; see `_solve`."""
+        levels, folds = self.grams.shape[:2]
+        amplitudes = np.empty((levels, len(RIDGES), folds, len(order)))
+        _solve(self.grams, np.append(0, order + 1), np.array(RIDGES), known, kept, amplitudes)
+        return amplitudes
 
     def _sums(
         self,
@@ -616,41 +650,49 @@ def _sum_squares(first, further, rows, amplitudes, fold, losses):
     """
     levels, ridges, blocks = losses.shape
     size = len(rows)
-    mix, along, least = np.ones((size, blocks)), np.empty(blocks), np.empty(blocks)
+    mix, along = np.ones((size, ridges, blocks)), np.empty((ridges, blocks))
+    least = np.empty((ridges, blocks))
     for level in range(levels):
-        for ridge in range(ridges):
-            total = losses[level, ridge]
-            for i in range(1, size):
+        total = losses[level]
+        for i in range(1, size):
+            for ridge in range(ridges):
                 for block in range(blocks):
-                    mix[i, block] = -amplitudes[level, ridge, fold[block], i - 1]
-            total[:] = 0.0
-            least[:] = 0.0
-            for i in range(size):
-                along[:] = 0.0
-                for j in range(i):
-                    product = _pair(first, further, level, rows[i], rows[j])
+                    mix[i, ridge, block] = -amplitudes[level, ridge, fold[block], i - 1]
+        total[:] = 0.0
+        least[:] = 0.0
+        for i in range(size):
+            along[:] = 0.0
+            for j in range(i):
+                product = _pair(first, further, level, rows[i], rows[j])
+                for ridge in range(ridges):
                     for block in range(blocks):
-                        along[block] += product[block] * mix[j, block]
-                own = _pair(first, further, level, rows[i], rows[i])
+                        along[ridge, block] += product[block] * mix[j, ridge, block]
+            own = _pair(first, further, level, rows[i], rows[i])
+            for ridge in range(ridges):
                 for block in range(blocks):
-                    square = own[block] * mix[i, block] * mix[i, block]
-                    total[block] += 2.0 * mix[i, block] * along[block] + square
-                    least[block] += square
+                    square = own[block] * mix[i, ridge, block] * mix[i, ridge, block]
+                    total[ridge, block] += 2.0 * mix[i, ridge, block] * along[ridge, block] + square
+                    least[ridge, block] += square
+        for ridge in range(ridges):
             for block in range(blocks):
-                total[block] = max(total[block], ROUNDING * least[block])
+                total[ridge, block] = max(total[ridge, block], ROUNDING * least[ridge, block])
 
 
 @compiled(reorder=True)
-def _solve(grams, rows, ridges, amplitudes):
+def _solve(grams, rows, ridges, known, kept, amplitudes):
     """Write least-squares amplitudes with each of r ridges into amplitudes (L, r, folds, k).
 
     grams (L, folds, C, C): products of the residual, row 0, and the sensitivities; rows (1 + k,)
     those that are looked at, 0 first. Normal matrices are scaled to a diagonal of 1 and factorised
     as L D L' (Golub & Van Loan 2013, section 4.1) without pivoting: the ridge is a thousand times
     the rounding of the products, so that no pivot is near zero.
+
+    known (L, folds, r, c, c + 1): the factors of the first c sensitivities, L below the diagonal,
+    D on it, and the right side after the elimination in the last column. kept: where those of all k
+    are written to, alike; without room (0 rows) they are not.
     """
     levels, folds = grams.shape[:2]
-    count = len(rows) - 1
+    count, common = len(rows) - 1, known.shape[3]
     scaled, lower, size = np.empty((count, count)), np.empty((count, count)), np.empty(count)
     row, pivot, found = np.empty(count), np.empty(count), np.empty(count)
     for level in range(levels):
@@ -661,16 +703,24 @@ def _solve(grams, rows, ridges, amplitudes):
                 most = max(most, gram[rows[i + 1], rows[i + 1]])
             for i in range(count):
                 size[i] = np.sqrt(max(gram[rows[i + 1], rows[i + 1]], 1e-12 * most))
+            for i in range(common, count):
                 for j in range(i + 1):
                     one, other = rows[i + 1], rows[j + 1]
                     both = 0.5 * (gram[one, other] + gram[other, one])
                     scaled[i, j] = both / (size[i] * size[j])
             for ridge in range(len(ridges)):
-                for i in range(count):
+                before = known[level, number, ridge]
+                for i in range(common):
+                    pivot[i], found[i] = before[i, i], before[i, common]
+                for i in range(common, count):
                     for j in range(i):
                         rest = scaled[i, j]
-                        for p in range(j):
-                            rest -= row[p] * lower[j, p]
+                        if j < common:
+                            for p in range(j):
+                                rest -= row[p] * before[j, p]
+                        else:
+                            for p in range(j):
+                                rest -= row[p] * lower[j, p]
                         row[j] = rest
                     rest = scaled[i, i] + ridges[ridge]
                     value = gram[rows[i + 1], 0] / size[i]
@@ -680,11 +730,19 @@ def _solve(grams, rows, ridges, amplitudes):
                         value -= lower[i, j] * found[j]
                     pivot[i] = rest
                     found[i] = value
+                for i in range(kept.shape[3]):
+                    after = kept[level, number, ridge, i]
+                    for j in range(i):
+                        after[j] = lower[i, j]
+                    after[i], after[count] = pivot[i], found[i]
                 for i in range(count):
                     found[i] /= pivot[i]
                 for i in range(count - 1, -1, -1):
                     for j in range(i):
-                        found[j] -= lower[i, j] * found[i]
+                        if i < common:
+                            found[j] -= before[i, j] * found[i]
+                        else:
+                            found[j] -= lower[i, j] * found[i]
                     amplitudes[level, ridge, number, i] = found[i] / size[i]
 
 

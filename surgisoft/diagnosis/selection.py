@@ -176,9 +176,12 @@ class ModelSelection:
             answer += amplitude * self.candidates[number].sensitivities[..., own]
         return answer
 
-    def losses(self, chosen: tuple[int, ...] = ()) -> np.ndarray:
-        """(B,) held-out sum of squared distances, mm^2, with the chosen sensitivities."""
-        return self.validation.losses(chosen)
+    def losses(self, chosen: tuple[int, ...] = (), common: tuple[int, ...] = ()) -> np.ndarray:
+        """(B,) held-out sum of squared distances, mm^2, with the chosen sensitivities.
+
+        common: those of them that many sets have in common (`CrossValidation.losses`).
+        """
+        return self.validation.losses(chosen, common)
 
     def rmse_mm(self, losses: np.ndarray) -> float:
         """RMS distance of a key point, mm."""
@@ -231,7 +234,7 @@ class ModelSelection:
         """Every form of every effect on top of a base, plausible or not, in no order."""
         before = self.losses(base)
         choices = [w for name, some in self.options.items() if name not in without for w in some]
-        after = [self.losses(base + option.chosen) for option in choices]
+        after = [self.losses(base + option.chosen, base) for option in choices]
         if not choices:
             return []
         gains = np.array([self.log_ratio(before, losses) for losses in after])
@@ -541,7 +544,8 @@ def best_pair(selection: ModelSelection, effects: Sequence[str]) -> tuple[Score,
 
     def worth(a: Option, b: Option) -> float:
         if (a, b) not in tried:
-            tried[a, b] = _together(selection, null, a.chosen + b.chosen)
+            common = max(a.chosen, b.chosen, key=len)
+            tried[a, b] = _together(selection, null, a.chosen + b.chosen, common)
         return tried[a, b]
 
     def improved(a: Option, b: Option) -> tuple[Option, Option]:
@@ -567,13 +571,18 @@ def best_pair(selection: ModelSelection, effects: Sequence[str]) -> tuple[Score,
     return ()
 
 
-def _together(selection: ModelSelection, null: np.ndarray, chosen: tuple[int, ...]) -> float:
+def _together(
+    selection: ModelSelection,
+    null: np.ndarray,
+    chosen: tuple[int, ...],
+    common: tuple[int, ...] = (),
+) -> float:
     """How well sensitivities explain: mean log gain of the blocks plus log gain of the whole error.
 
     Few blocks that fall by much and many that fall by little both count. The noise is added to
     both, and amplitudes have their price.
     """
-    losses, floor = selection.losses(chosen), selection.floor.sum()
+    losses, floor = selection.losses(chosen, common), selection.floor.sum()
     whole = float(np.log((null.sum() + floor) / (losses.sum() + floor)))
     return SEARCH.priced(selection.log_ratio(null, losses).mean() + whole, len(chosen))
 

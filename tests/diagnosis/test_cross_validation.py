@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
+from surgisoft.diagnosis import cross_validation
 from surgisoft.diagnosis.cross_validation import (
     PERSISTENCE,
     RIDGES,
@@ -86,6 +87,19 @@ def test_losses_are_those_of_joint_fits(data, picked):
         for share in shares
     ]
     assert found.losses(picked) == pytest.approx(min(tried, key=np.sum), rel=2e-4)
+
+
+@pytest.mark.parametrize("common", [[1], [0, 2], [0, 1, 2]])
+def test_what_sets_have_in_common_is_factorised_once(monkeypatch, data, common):
+    """The set of all columns, after the fit to some of them was kept."""
+    monkeypatch.setattr(cross_validation, "LARGE", 1)
+    surrogate, noise = np.array([0.3, 0.5]), np.array([0.1, 0.1])
+    found = cross_validated(*data, surrogate, noise)
+    shares = itertools.product(PERSISTENCE, RIDGES)
+    tried = [brute(data, [0, 1, 2], *each, surrogate, noise) for each in shares]
+    assert found.losses([0, 1, 2], common) == pytest.approx(min(tried, key=np.sum), rel=2e-4)
+    plain = cross_validated(*data, surrogate, noise).amplitudes([2, 0, 1])
+    assert found.amplitudes([2, 0, 1]) == pytest.approx(plain, rel=1e-9)
 
 
 def test_losses_of_collinear_columns_are_those_of_joint_fits(data):

@@ -40,7 +40,7 @@ class Table:
     options: ClassVar = forms_of(NAMES, 1)
     loss: ClassVar = LOSS
 
-    def losses(self, chosen=()):
+    def losses(self, chosen=(), common=()):
         rng = np.random.default_rng(0)
         share = rng.uniform(0.9, 1.1, 40)
         return self.loss["".join(str(p) for p in sorted(set(chosen)))] * share / 40

@@ -68,7 +68,7 @@ GROUND = {"__version__"} | {path.stem for path in PACKAGE.glob("*.py")}
 
 FLOORS = {
     "diagnosis": (
-        ("body_frame", "criteria", "history_features", "statistics", "weight"),
+        ("body_frame", "change_points", "criteria", "history_features", "statistics", "weight"),
         ("residuals",),
         ("other_models",),
         ("abrupt", "discrepancy", "data_quality", "error_axes", "inputs", "known_error"),

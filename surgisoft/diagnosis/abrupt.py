@@ -7,8 +7,7 @@ A key point that shifts against its neighbours from one moment on is a marker th
 Neighbouring key points lie on one body, so whatever physics changes, the residual of one follows
 from those of the others and from the actuation. What does not is an error of that key point alone.
 A step in it at one moment is sought on held-out blocks (with a known moment: Chow 1960; the moment
-is searched: Andrews 1993, "Tests for parameter instability and structural change with unknown
-change point", Econometrica 61).
+is searched, see `change_points`).
 """
 
 from dataclasses import dataclass
@@ -16,16 +15,11 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
+from surgisoft.diagnosis import change_points
 from surgisoft.diagnosis.residuals import Problem, ResidualTable
 from surgisoft.diagnosis.statistics import FoldsOfRidge, block_sums
 from surgisoft.measurement.jumps import BodyJumps, Jumps, Motion, find_jumps, own_level_mm
 
-MOMENTS = 24
-"""Moments that are tried for each key point."""
-FINER = 8
-"""Steps between two of these, in which the best of them is refined."""
-MARGIN = 0.04
-"""Share of the rows before the first moment, and behind the last one."""
 RIDGE = 10.0
 """Ridge on columns of mean square 1: the weight of ten rows."""
 LEAST_ABOVE = 0.02
@@ -112,7 +106,6 @@ def key_point_shift(problem: Problem) -> KeyPointShift | None:
     above = max(square - float(noise.sum()), LEAST_ABOVE * square, 1e-30)
     block = np.unique(problem.block[rows], return_inverse=True)[1]
     fold = problem.fold[problem.block[rows]]
-    moments = np.linspace(MARGIN, 1.0 - MARGIN, MOMENTS) * len(rows)
     actuation = _quadratic(problem.pressure[rows])
     ones = np.ones((len(rows), 1), np.float32)
     best: KeyPointShift | None = None
@@ -125,9 +118,8 @@ def key_point_shift(problem: Problem) -> KeyPointShift | None:
         target = residual[:, place].astype(np.float32)
         folds = FoldsOfRidge(columns, target, fold)
         left = folds.remainder(RIDGE)
-        first, _ = _best_step(folds, ones, moments)
-        near = first + np.arange(1 - FINER, FINER) / FINER * (moments[1] - moments[0])
-        first, stepped = _best_step(folds, ones, near)
+        first, _ = _best_step(folds, ones, change_points.coarse())
+        first, stepped = _best_step(folds, ones, change_points.finer(first / len(rows)))
         plain, after = (
             block_sums(np.square(each, dtype=float).sum(1), block) for each in (left, stepped)
         )
@@ -155,9 +147,9 @@ def _best_step(
 ) -> tuple[int, np.ndarray]:
     """First row of the step that leaves least on held-out rows, and what it leaves (S, 3), mm.
 
-    moments: (M,) first rows that are tried, rounded down; ones: (S, 1).
+    moments: (M,) shares of the rows before the step that are tried; ones: (S, 1).
     """
-    behind = np.unique(moments.astype(int))
+    behind = np.unique((moments * len(ones)).astype(int))
     left = folds.with_breaks(RIDGE, ones, behind)
     best = int(np.argmin([np.square(each, dtype=float).sum() for each in left]))
     return int(behind[best]), left[best]

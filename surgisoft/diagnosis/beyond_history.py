@@ -22,6 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from surgisoft.diagnosis import change_points
 from surgisoft.diagnosis.cross_validation import CrossValidation, Split
 from surgisoft.diagnosis.residuals import Problem
 from surgisoft.diagnosis.statistics import FoldsOfRidge, block_sums
@@ -29,12 +30,6 @@ from surgisoft.diagnosis.statistics import FoldsOfRidge, block_sums
 RIDGES = (0.5, 5.0, 50.0)
 """Ridges on the features of the black box that are tried, for features of mean square 1 in all: up
 to the weight of as many rows. The best on held-out blocks is taken."""
-BREAKS = 24
-"""Moments that are tried. The nearest one is off by a fiftieth of the time at most."""
-FINER = 8
-"""Steps between two of these, in which the moment of a sudden turn is refined."""
-MARGIN = 0.04
-"""Share of the rows before the first moment, and behind the last one."""
 LEAST_PERIODS = 4.0
 """Fewest periods in a recording: below, a line is not told from a slow drift."""
 OVERSAMPLED = 2
@@ -73,7 +68,7 @@ def beyond_history(problem: Problem, features: np.ndarray) -> BeyondHistory:
     best = int(np.argmin([np.square(each, dtype=float).sum() for each in tried]))
     remainder = tried[best]
     state = np.concatenate([ones, problem.pressure], axis=1).astype(np.float32)
-    places = np.linspace(MARGIN, 1.0 - MARGIN, BREAKS)
+    places = change_points.coarse()
     broken = folds.with_breaks(RIDGES[best], state, (places * len(target)).astype(int))
     sums = [np.square(each, dtype=float).sum() for each in broken]
     place = int(np.argmin(sums))
@@ -97,7 +92,7 @@ class SuddenTurn:
     """A rigid turn and shift of the whole body that sets in at one moment."""
 
     losses: np.ndarray
-    """(B,) held-out sum of squared distances by block with the best of BREAKS moments, mm^2."""
+    """(B,) held-out sum of squared distances by block with the best of the coarse moments, mm^2."""
     at: float
     """Its place, as a share of the rows, 0 to 1, refined between the neighbours of that moment."""
 
@@ -111,10 +106,8 @@ def sudden_turn(split: Split, points: np.ndarray) -> SuddenTurn:
     axes = np.eye(3)
     turned = np.cross(axes, points[:, :, None, :])  # (S, n, 3 axes, 3)
     rigid = np.concatenate([turned, np.broadcast_to(axes, turned.shape)], axis=2).swapaxes(2, 3)
-    places = np.linspace(MARGIN, 1.0 - MARGIN, BREAKS)
-    place, losses = _best_moment(split, rigid, places)
-    near = place + np.arange(1 - FINER, FINER) / FINER * (places[1] - places[0])
-    place, _ = _best_moment(split, rigid, np.clip(near, MARGIN, 1.0 - MARGIN))
+    place, losses = _best_moment(split, rigid, change_points.coarse())
+    place, _ = _best_moment(split, rigid, change_points.finer(place))
     return SuddenTurn(losses, place)
 
 

@@ -125,7 +125,7 @@ def best_layer(model: ArmModel, problem: Problem) -> Retuned:
     held += 1e-6 * np.trace(held) / len(held) * np.eye(len(held))
     residual = problem.residual.reshape(count, -1)
     part = held_out_parts(problem)
-    found = [_held_out(hidden, residual, part, ridge * held) for ridge in RIDGES]
+    found = _held_out(hidden, residual, part, held)
     best = int(np.argmin([np.square(left).sum() for left in found]))
     gain = _gain_by_block(residual, found[best], problem.block)
     total = float(np.nansum(np.square(residual)))
@@ -133,7 +133,7 @@ def best_layer(model: ArmModel, problem: Problem) -> Retuned:
     chance = stats.ttest_1samp(gain, 0.0, alternative="greater").pvalue
     if not (share >= LEAST_GAIN and chance < CHANCE):
         return Retuned(model, False, share)
-    change = torch.from_numpy(_ridge(hidden, residual, RIDGES[best] * held)).float()
+    change = torch.from_numpy(_ridge(hidden, residual, held, RIDGES[[best]])[0]).float()
     network = copy.deepcopy(network)
     last = network.layers[-1]
     assert isinstance(last, nn.Linear)
@@ -162,29 +162,35 @@ def _over_range(model: ArmModel) -> tuple[Tensor, Tensor]:
     return actuation, direction
 
 
-def _ridge(hidden: np.ndarray, residual: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """(H + 1, 3n) change of the layer; a row with a missing key point does not count for it."""
-    answer = np.zeros((hidden.shape[1], residual.shape[1]))
+def _ridge(
+    hidden: np.ndarray, residual: np.ndarray, held: np.ndarray, ridges: np.ndarray
+) -> np.ndarray:
+    """(R, H + 1, 3n) change of the layer for each ridge (R,); a row with a missing key point does
+    not count for it."""
+    answer = np.zeros((len(ridges), hidden.shape[1], residual.shape[1]))
     known: dict[bytes, list[int]] = {}
     for k in range(residual.shape[1]):
         known.setdefault(np.isfinite(residual[:, k]).tobytes(), []).append(k)
     for columns in known.values():
         seen = np.isfinite(residual[:, columns[0]])
         inside = hidden[seen]
-        normal = inside.T @ inside + held * seen.sum()
-        answer[:, columns] = np.linalg.solve(normal, inside.T @ residual[seen][:, columns])
+        normal, right = inside.T @ inside, inside.T @ residual[seen][:, columns]
+        for change, ridge in zip(answer, ridges, strict=True):
+            change[:, columns] = np.linalg.solve(normal + ridge * held * seen.sum(), right)
     return answer
 
 
 def _held_out(
     hidden: np.ndarray, residual: np.ndarray, part: np.ndarray, held: np.ndarray
-) -> np.ndarray:
-    """(S, 3n) what is left of each row by the layer that was fitted without its part, mm."""
-    left = np.zeros_like(residual)
+) -> list[np.ndarray]:
+    """For each ridge, (S, 3n) what is left of each row by the layer fitted without its part, mm."""
+    found = [np.zeros_like(residual) for _ in RIDGES]
     for number in np.unique(part):
         rows = part == number
-        left[rows] = residual[rows] - hidden[rows] @ _ridge(hidden[~rows], residual[~rows], held)
-    return np.nan_to_num(left)
+        changes = _ridge(hidden[~rows], residual[~rows], held, RIDGES)
+        for left, change in zip(found, changes, strict=True):
+            left[rows] = residual[rows] - hidden[rows] @ change
+    return [np.nan_to_num(left) for left in found]
 
 
 def _gain_by_block(before: np.ndarray, after: np.ndarray, block: np.ndarray) -> np.ndarray:

@@ -10,6 +10,8 @@ from typer.main import get_command
 
 from surgisoft.cli import run, with_commands
 from surgisoft.errors import InputError
+from surgisoft.experiments.run import open_results, run_experiment
+from surgisoft.experiments.spec import load_experiment
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.measurement.recordings.lerobot import save_lerobot
@@ -65,7 +67,7 @@ COMMANDS = {
     "rig check": "rig check virtual --model arm",
     "train": "train --task track_circle --arm arm --envs 8 --steps 64 -o run",
     "export": "export arm -o exported",
-    "evaluate": "evaluate scripted --task track_circle --arm arm --episodes 1",
+    "evaluate": "evaluate random --task track_circle --arm arm --episodes 1",
     "scene new": "scene new ball.ply --unit mm --arm arm -o placed",
     "scene check": "scene check scene",
     "scene show": "scene show scene --save view.rrd",
@@ -92,7 +94,7 @@ def lab(tmp_path_factory):
     save_model(with_slack, folder / "arm")
     user_defined.FILES.clear()
     rig = VirtualRig(0, take=7)
-    recording = rig.record(make_protocol("mixed", rig.limits, 1200, seed=2))[0]
+    recording = rig.record(make_protocol("mixed", rig.limits, 600, seed=2))[0]
     save_recording(recording, folder / "bench.parquet")
     save_lerobot([recording], folder / "dataset", "Drive the soft arm.", None)
     (folder / "few.csv").write_text("t_s,c1_kPa,c2_kPa,c3_kPa\n0,0,0,0\n1,5,0,0\n")
@@ -167,10 +169,10 @@ def same_rows_in_one_process():
     """The two processes of `experiment run`, which need the file too, gave the rows of one."""
     both = sorted(Path("results", "rows").iterdir())
     assert len(both) == 2, "two episodes, each one a block of work"
-    alone = "experiment run short.toml --no-replays -o alone --force --effect-file slack.py"
-    assert run(alone.split()) == 0
     rows = [json.loads(path.read_text()) for path in both]
-    assert rows == [json.loads(Path("alone", "rows", path.name).read_text()) for path in both]
+    spec, alone = load_experiment("short.toml"), Path("alone")
+    open_results(spec, alone)
+    assert run_experiment(spec, alone) == rows
     assert rows[0] != rows[1]
 
 
@@ -181,7 +183,7 @@ def test_amend_takes_the_file_as_the_effect_that_the_model_has(capsys):
 
 
 def test_fit_takes_the_file_in_both_ways():
-    rest = "--epochs 2 --widths 8,8 --inputs pressure"
+    rest = "--epochs 2 --widths 8,8 --inputs pressure --prior none"
     assert run(f"fit bench.parquet -o one --effects slack.py {rest}".split()) == 0
     user_defined.FILES.clear()
     more = f"fit bench.parquet -o other --effects slack --effect-file slack.py {rest}"

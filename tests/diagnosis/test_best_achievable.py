@@ -78,7 +78,7 @@ def gated(rows: int):
     ("model", "recorded", "source"),
     [
         ("default", lambda: [bench("leak", 3)], "sidecar"),
-        ("default", lambda: [bench("payload", 5, 2500), bench("payload", 6, 2000)], "sidecar"),
+        ("default", lambda: [bench("payload", 5, 1200), bench("payload", 6, 1000)], "sidecar"),
         ("default", lambda: [replace(bench("hysteresis", 7, 6000), noise_mm=None)], "holds"),
         (None, lambda: [gated(ROWS)], "second differences"),
     ],
@@ -115,7 +115,7 @@ def test_compare_and_diagnose_give_one_floor_and_one_best_achievable_error(model
 
 def test_rows_that_diagnose_does_not_see_do_not_change_the_best_achievable_error():
     """Held-out rows are off by 5 mm: the error says so; floor, best error and share stay."""
-    made = bench("creep", 3)
+    made = bench("creep", 3, 1500)
     points = made.key_points_mm.copy()
     points[held_out_rows([made])] += 5.0
     model = load_model("default")

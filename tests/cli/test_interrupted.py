@@ -169,7 +169,7 @@ def test_ctrl_c_in_improve_keeps_the_finished_rounds(tmp_path):
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no SIGINT to one process")
 def test_ctrl_c_in_evaluate_keeps_the_finished_policies(tmp_path):
     """The same numbers as without an interruption, and none of the policy that was interrupted."""
-    task = "evaluate scripted random --task track_circle --episodes 3"
+    task = "evaluate scripted random --task track_circle --episodes 2"
     command = f"{task} --json j.json --report page --replay r.rrd"
     out, error = interrupted(command, "evaluate: .*random", tmp_path)
     found = json.loads((tmp_path / "j.json").read_text())
@@ -179,7 +179,7 @@ def test_ctrl_c_in_evaluate_keeps_the_finished_policies(tmp_path):
     whole = json.loads((tmp_path / "whole.json").read_text())
     assert not whole["interrupted"]
     assert found["policies"] == whole["policies"]
-    words = "interrupted; finished of 3 episodes each: scripted 3, random 0"
+    words = "interrupted; finished of 2 episodes each: scripted 2, random 0"
     assert words in error
     assert words in out
     assert words in (tmp_path / "page" / "report.html").read_text(encoding="utf-8")

@@ -83,16 +83,15 @@ class Adversaries:
         self.supervision = TASKS[task.name].experiment.supervise(task)
         self.names = [name for name in ADVERSARIES if name not in without]
         self.chosen = {agent: np.zeros(count, int) for agent in task.agents}
-        self.old: deque[TaskState] = deque(maxlen=STALE)
+        self.old: deque[dict[str, Tensor]] = deque(maxlen=STALE)
 
     def actions(self, state: TaskState) -> dict[str, Tensor]:
         """Actions of all agents, agent -> (B, m) kPa."""
-        self.old.append(state)
         expert = self.task.script(state)
+        self.old.append(expert)
         if self.warm > 0:
             self.warm -= 1
             return expert
-        stale = self.task.script(self.old[0])
         found = {}
         for agent in self.task.agents:
             chosen = self._drawn(agent)
@@ -100,7 +99,7 @@ class Adversaries:
             for number, name in enumerate(self.names):
                 mask = torch.from_numpy(chosen == number)
                 if name != "expert" and mask.any():
-                    other = stale[agent] if name == "stale" else self._of(name, agent, state)
+                    other = self.old[0][agent] if name == "stale" else self._of(name, agent, state)
                     action = torch.where(mask[:, None], other, action)
             found[agent] = action
         return found

@@ -30,32 +30,42 @@ def least_squares(
     """
     best = torch.minimum(torch.maximum(start, low), high)
     factor = best.new_full((len(best), 1, 1), damping)
-    error, jacobian = _linearised(residual, best)
+    place, value = _traced(residual, best)
+    error, jacobian = value.detach(), _jacobian(place, value)
     eye = torch.eye(best.shape[1], dtype=best.dtype, device=best.device)
-    for _ in range(iterations):
+    for left in reversed(range(iterations)):
         normal = jacobian.mT @ jacobian
         size = normal.diagonal(dim1=1, dim2=2).mean(1)[:, None, None].clamp(min=1e-12)
         pull = (jacobian.mT @ error[..., None])[..., 0]
         move = torch.linalg.solve_ex(normal + factor * size * eye, pull)[0]
         tried = torch.minimum(torch.maximum(best - move, low), high)
-        new_error, new_jacobian = _linearised(residual, tried)
+        place, value = _traced(residual, tried)
+        new_error = value.detach()
         better = new_error.square().sum(1) < error.square().sum(1)
         best = torch.where(better[:, None], tried, best)
+        if left == 0:
+            break
         error = torch.where(better[:, None], new_error, error)
-        jacobian = torch.where(better[:, None, None], new_jacobian, jacobian)
+        jacobian = torch.where(better[:, None, None], _jacobian(place, value), jacobian)
         factor = torch.where(better[:, None, None], 0.1 * factor, 10.0 * factor).clamp(1e-6, 1e6)
     return best
 
 
-def _linearised(residual: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tensor, Tensor]:
-    """Residuals (B, r) and their Jacobians (B, r, m) at (B, m); works under inference_mode."""
+def _traced(residual: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tensor, Tensor]:
+    """A copy of the points (B, m) and residuals (B, r) that depend on it; works under
+    inference_mode."""
     with torch.inference_mode(False), torch.enable_grad():
         place = at.clone().requires_grad_(True)
-        value = residual(place)
+        return place, residual(place)
+
+
+def _jacobian(place: Tensor, value: Tensor) -> Tensor:
+    """Jacobians (B, r, m) of residuals (B, r) at the points (B, m) that they depend on."""
+    with torch.inference_mode(False), torch.enable_grad():
         one = torch.eye(value.shape[1], dtype=value.dtype, device=value.device)
         each = one[:, None].expand(-1, len(value), -1)
         slopes = torch.autograd.grad(value, place, each, is_grads_batched=True)[0]
-    return value.detach(), slopes.movedim(0, 1)
+    return slopes.movedim(0, 1)
 
 
 STUCK_MM = 1e-3

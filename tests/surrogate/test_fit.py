@@ -102,8 +102,9 @@ def test_excitation_distinguishes_a_random_walk_from_a_traverse():
     assert fast.reversals == 144
 
 
-def test_same_seed_same_weights(walks):
-    train, valid, _ = walks
+def test_same_seed_same_weights():
+    rng = np.random.default_rng(1)
+    train, valid = (history([walk(n, rng) for _ in range(4)], noise=NOISE) for n in (100, 50))
     config = FitConfig(hidden=(16,), epochs=3, effects=("hysteresis",))
     one, other = (fit(train, valid, SPEC, config).model.state_dict() for _ in range(2))
     assert one.keys() == other.keys()

@@ -39,7 +39,7 @@ def exact(name, geometry="fcl"):
 def test_pettingzoo_api(name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        parallel_api_test(SurgicalEnv(exact(name)), num_cycles=60)
+        parallel_api_test(SurgicalEnv(exact(name)), num_cycles=20)
 
 
 @every_task
@@ -55,7 +55,7 @@ def test_pettingzoo_runs_alike_for_many_steps(name):
         rng, heard = np.random.default_rng(0), []
         for seed in (7, None):
             env.reset(seed=seed)
-            for _ in range(30):
+            for _ in range(15):
                 shapes = {agent: env.action_space(agent).shape for agent in env.agents}
                 actions = {a: rng.uniform(-3, 3, s).astype("f4") for a, s in shapes.items()}
                 seen, rewards, *_, infos = env.step(actions)
@@ -211,19 +211,20 @@ def test_wrong_use_is_one_line():
 
 @every_task
 @pytest.mark.parametrize("geometry", ["fcl", "batched"])
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
-def test_a_copied_environment_goes_on_as_the_original(name, geometry, copied):
+def test_a_copied_environment_goes_on_as_the_original(name, geometry):
     """In the middle of an episode; SuperSuit and AsyncVectorEnv copy environments."""
     env = SurgicalEnv(exact(name, geometry))
     env.reset(seed=5)
     push = {agent: np.full(3, 1.5, np.float32) for agent in env.agents}
     for _ in range(3):
         env.step(push)
-    other = copied(env)
+    others = copy.deepcopy(env), pickle.loads(pickle.dumps(env))
     for _ in range(3):
-        for one, two in zip(env.step(push), other.step(push), strict=True):
-            for agent in push:
-                np.testing.assert_array_equal(one[agent], two[agent])
+        expected = env.step(push)
+        for other in others:
+            for one, two in zip(expected, other.step(push), strict=True):
+                for agent in push:
+                    np.testing.assert_array_equal(one[agent], two[agent])
 
 
 def test_gymnasium_takes_the_arm_and_refuses_what_it_does_not_know(tmp_path):

@@ -113,7 +113,7 @@ def test_observations_lie_in_the_stated_ranges(name):
             if step == 20:  # the last steps of the episodes
                 late = torch.full_like(world.steps, task.steps - 20)
                 state = dataclasses.replace(state, world=dataclasses.replace(world, steps=late))
-            if step % 3 == 0:
+            if step % 8 == 0:
                 actions = task.script(state)
             else:
                 actions = {

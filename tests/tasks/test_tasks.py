@@ -72,7 +72,7 @@ def test_a_batch_of_n_is_n_batches_of_one(name):
     episodes = Episodes(task_of(name))
     together = episodes.seeded(3, 3)
     alone = [episodes.seeded(3, 1, first=i) for i in range(3)]
-    for step in range(20):
+    for step in range(10):
         actions = random_actions(episodes.task, 3, step)
         together, outcome = episodes.step(together, actions)
         seen = episodes.observe(together)
@@ -91,7 +91,7 @@ def test_a_batch_of_n_is_n_batches_of_one(name):
 @every_task
 def test_the_same_seed_gives_the_same_episode_to_the_last_step(name):
     episodes = Episodes(task_of(name))
-    steps = 60
+    steps = 30
     (_, total, seen), (_, again, seen_again) = (played(episodes, 3, steps, seed=8) for _ in "ab")
     assert torch.equal(total, again)
     for one, other in zip(seen, seen_again, strict=True):

@@ -120,10 +120,10 @@ def test_train_and_evaluate_give_what_the_commands_write(tmp_path, monkeypatch):
     assert run_.result.done
     again = "train --task track_circle -o theirs --steps 64 --envs 8 --seed 5"
     assert run(again.split()) == 0
-    found = surgisoft.evaluate(["mine", "theirs", "scripted"], episodes=2, seed=1)
-    mine, theirs, scripted = found.to_json()["policies"].values()
-    assert mine["overall"] == theirs["overall"] != scripted["overall"]
-    command = "evaluate mine theirs scripted --episodes 2 --seed 1 --json out.json"
+    found = surgisoft.evaluate(["mine", "theirs", "random"], episodes=2, seed=1)
+    mine, theirs, random = found.to_json()["policies"].values()
+    assert mine["overall"] == theirs["overall"] != random["overall"]
+    command = "evaluate mine theirs random --episodes 2 --seed 1 --json out.json"
     assert run(command.split()) == 0
     written = json.loads((tmp_path / "out.json").read_text())
     assert written == json.loads(json.dumps(found.to_json()))

@@ -409,7 +409,7 @@ def test_another_arm_model_takes_the_default_ones_place(name, tmp_path):
 
 def reward_terms(name, config=None):
     """Weighted terms of one random step, agent -> term -> (B,)."""
-    episodes = Episodes(make_task(name, config))
+    episodes = Episodes(task_of(name) if config is None else make_task(name, config))
     state = episodes.seeded(2, 3)
     _, outcome = episodes.step(state, random_actions(episodes.task, 3, 0))
     return outcome.terms

@@ -140,7 +140,7 @@ def test_policies_are_evaluated_without_the_replay_extra(tmp_path):
     done = core(
         """
 from surgisoft.cli import run
-print(run("evaluate scripted --task track_circle --episodes 1 --json x.json".split()))
+print(run("evaluate random --task track_circle --episodes 1 --json x.json".split()))
 """,
         without={"rerun", "rerun_cli", "rerun_bindings"},
         cwd=tmp_path,

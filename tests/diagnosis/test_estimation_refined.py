@@ -91,7 +91,7 @@ def test_a_lag_before_the_plays_is_no_viscosity_behind_them(lagging, monkeypatch
     assert found.ranking[0].effect == "line_lag"
     assert found.verdict.effects[:1] == ("line_lag",)
     monkeypatch.setattr(selection, "refined", lambda *_: [])
-    grid = diagnose(default_arm(), [lagging], setup_tests=False)
+    grid = diagnose(default_arm(), [lagging])
     fine = {row.effect: row.heldout_rmse_mm for row in found.ranking}
     rough = {row.effect: row.heldout_rmse_mm for row in grid.ranking}
     assert fine["line_lag"] < 0.7 * rough["line_lag"]

@@ -30,7 +30,8 @@ PERSISTENCE = (5.0, 50.0, 500.0)
 more than white noise of its size. The one that does best on held-out blocks is taken."""
 
 LARGE = 48
-"""Number of sensitivities from which what many sets have in common is factorised once for all."""
+"""Number of sensitivities from which what many sets have in common is factorised once for all. It
+decides on processor time alone: results are equal but for rounding."""
 STRIP = 1 << 20
 """Numbers of a field that are worked through at once: 4 MB, of which the cache holds a few."""
 REFERENCE_WEIGHT = 3.0

@@ -1,5 +1,6 @@
 """`InputError`, the one error type for bad input from outside: files, options, names; warnings."""
 
+import difflib
 from collections.abc import Iterable
 from typing import Any
 
@@ -50,7 +51,11 @@ def one_line(text: str) -> str:
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> InputError:
     """InputError for a name that a registry lacks; the message lists the known names."""
-    return InputError(f"unknown {kind} '{name}': known are {', '.join(sorted(known))}")
+    known = sorted(known)
+    near = [each for each in known if len(name) > 2 and each.startswith(name)]
+    near = near or difflib.get_close_matches(name[:100], known, 1)
+    hint = f"; did you mean '{near[0]}'?" if len(near) == 1 else ""
+    return InputError(f"unknown {kind} '{name}': known are {', '.join(known)}{hint}")
 
 
 def exists_already(path: object) -> InputError:

@@ -258,12 +258,13 @@ def _show(found) -> None:
         print(f"not testable: {each.effect}: {each.reason}")
     if found.implausible:
         names = ", ".join(found.implausible)
-        print(f"not ranked: {names} (their parameters would be implausible)")
+        print(f"not ranked, because of implausible parameters: {names}")
     if found.refit is not None:
         _show_refit(found.refit)
     if found.next_experiment:
         plan = found.next_experiment
         pairs = ", ".join(" from ".join(pair) for pair in plan.separates)
+        pairs = pairs or "none for certain"
         print(f"next experiment: {plan.name}, {plan.minutes:g} minutes, distinguishes {pairs}")
     print(f"{found.seconds:.1f} s")
 

@@ -37,8 +37,9 @@ def actuation_of(recording: Recording, actuation: str) -> np.ndarray:
         return recording.measured
     if recording.commanded is None:
         raise InputError(
-            f"{recording.label}: no commanded actuation (columns c1_{recording.unit} ...); "
-            "use --actuation measured"
+            f"{recording.label}: no commanded actuation (columns c1_{recording.unit} ...), which a "
+            "model of commanded actuation takes; add these columns, or fit a model with "
+            "--actuation measured"
         )
     return recording.commanded
 

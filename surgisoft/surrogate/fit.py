@@ -500,6 +500,12 @@ def _still_chambers(train: History, spec: ArmSpec) -> list[str]:
     """A note for each chamber that hardly moved in the training recordings."""
     pressure = train.rows(train.pressure)
     moved = (pressure.amax(0) - pressure.amin(0)).tolist()
+    if not max(moved):
+        raise InputError(
+            f"no chamber moves in the training recordings (all stay at {pressure[0].tolist()} "
+            f"{spec.unit}), expected recordings of a moving arm; record a schedule such as that of "
+            "'surgisoft collect'"
+        )
     return [
         f"chamber {number} hardly moved ({moved_by:.3g} {spec.unit} in all): "
         "its influence cannot be learned from these recordings"

@@ -157,6 +157,12 @@ def test_too_few_rows_are_refused():
         fit(short, None, SPEC, QUICK)
 
 
+def test_an_arm_that_never_moves_is_refused():
+    still = history([np.full((60, 3), 12.0)])
+    with pytest.raises(InputError, match=r"no chamber moves in the training recordings .all stay"):
+        fit(still, None, SPEC, QUICK)
+
+
 @pytest.mark.parametrize(("value", "message"), [(1e30, "farther than"), (1e200, "farther than")])
 def test_absurd_key_points_are_refused(walks, value, message):
     points = walks[1].key_points.double().clone()

@@ -30,6 +30,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from surgisoft.diagnosis.data_quality import FAR_ROWS, far_share
 from surgisoft.diagnosis.estimation.effects import fit_effects, shrink, starts
@@ -45,6 +46,7 @@ from surgisoft.diagnosis.statistics import (
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.progress import Progress, silent
 from surgisoft.surrogate.effects import Memoryless, Stage, in_words, known_effects
+from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel, Validation
 from surgisoft.surrogate.training import Data, JointTraining, train_jointly
 from surgisoft.workers import torch_threads, workers
@@ -291,6 +293,8 @@ def beside(value: float, reference: float) -> str:
     return f"{ratio:.3g} times" if ratio >= 1.005 else "as large as"
 
 
+FRONT: tuple[Stage, ...] = ("line", "material")
+"""Stages in front of the network."""
 LINE: Stage = "line"
 """Stage between a command and the pressure of a chamber. A first-order lag of the pressure and one
 of the wall are the same operator on the actuation: where both fit as well and the model's input is
@@ -312,7 +316,12 @@ def _of_line(effect: str) -> bool:
 def can_hide(name: str) -> bool:
     """Whether a network can hide an effect by imitation: one with memory that acts in front."""
     kind = known_effects()[name]
-    return kind.stage in ("line", "material") and not issubclass(kind, Memoryless)
+    return kind.stage in FRONT and not issubclass(kind, Memoryless)
+
+
+def in_front(names: Iterable[str]) -> list[str]:
+    """The effects among them that act in front of the network and can be trained with it."""
+    return [name for name in names if known_effects()[name].stage in FRONT]
 
 
 def hideable(problem: Problem, without: Iterable[str] = ()) -> tuple[list[str], dict[str, str]]:
@@ -330,7 +339,7 @@ def hideable(problem: Problem, without: Iterable[str] = ()) -> tuple[list[str], 
             continue
         if name in problem.model.effects:
             left[name] = "the model has it already, and it was fitted with the network"
-        elif kind.stage not in ("line", "material"):
+        elif kind.stage not in FRONT:
             left[name] = f"acts on the {kind.stage}, behind the network: the residuals decide"
         elif kind.stage == LINE and problem.model.spec.actuation == "measured":
             left[name] = (
@@ -390,7 +399,7 @@ class Split:
     problem: Problem
     """The problem."""
     data: Data
-    """Its thinned rows; none is held out."""
+    """Its thinned rows, as the network has to reach them (`behind_network_mm`); none held out."""
     part: np.ndarray
     """(B,) the part of each block."""
     unit: np.ndarray
@@ -407,7 +416,7 @@ class Split:
         seen = np.flatnonzero(problem.block_of_row >= 0)
         kept = np.zeros(len(problem.block_of_row), bool)
         kept[seen[:: max(1, -(-len(seen) // config.rows))]] = True
-        points = history.key_points.clone()
+        points = history.key_points - behind_network_mm(problem.model, history)
         points[history.valid] = points[history.valid].masked_fill(
             ~torch.from_numpy(kept)[:, None, None], torch.nan
         )
@@ -446,6 +455,19 @@ class Split:
         sums = np.zeros((len(names), *values.shape[:-1]))
         np.add.at(sums, place, np.moveaxis(values, -1, 0))
         return np.moveaxis(sums, 0, -1)
+
+
+@torch.no_grad()
+def behind_network_mm(model: ArmModel, history: History) -> Tensor | float:
+    """(R, T, n, 3) what a model's effects on body and sensors move its key points by, mm.
+
+    The network is trained to reach the measured key points less this, because these effects act
+    behind it. 0 where the model has none.
+    """
+    front = {name: each for name, each in model.effects.items() if each.stage in FRONT}
+    if len(front) == len(model.effects):
+        return 0.0
+    return model.predict(history) - model.replace(effects=front).predict(history)
 
 
 def _run_of_block(problem: Problem) -> np.ndarray:
@@ -687,7 +709,7 @@ def check_trainable(model: ArmModel, effects: Iterable[str] = ()) -> None:
         )
     for name in effects:
         stage = known_effects()[name].stage
-        if stage not in ("line", "material"):
+        if stage not in FRONT:
             raise InputError(
                 f"{name} acts on the {stage}, behind the network, and is not fitted together with "
                 "it: expected effects of line or material; pass --refit never"
@@ -869,6 +891,13 @@ class JointFit:
     """The effects' parameters; intervals are not known, so their ends are the values."""
     in_words: dict[str, str]
     """What the parameters mean, by effect."""
+
+    def beside(self, parameters: Iterable[Parameter], in_words: dict[str, str]) -> "JointFit":
+        """The same with the parameters of effects that the model had and that were not trained."""
+        mine = {parameter.effect for parameter in self.parameters}
+        kept = [each for each in parameters if each.effect not in mine]
+        words = {name: text for name, text in in_words.items() if name not in mine}
+        return replace(self, parameters=(*kept, *self.parameters), in_words=words | self.in_words)
 
 
 ALL_ROWS = 10**9

@@ -1,5 +1,6 @@
 """A refit names a lag that the network has learned to imitate, and leaves a clean arm alone."""
 
+import copy
 import json
 from dataclasses import asdict, replace
 from functools import partial
@@ -14,19 +15,27 @@ from surgisoft.diagnosis import amend as amending
 from surgisoft.diagnosis import diagnose as diagnosing
 from surgisoft.diagnosis import improve as improving
 from surgisoft.diagnosis import refit as refitting
+from surgisoft.diagnosis.candidates import with_effect
 from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Ranked, Verdict, with_refit
+from surgisoft.diagnosis.estimation.intervals import Parameter
 from surgisoft.diagnosis.inputs import identification_problem
 from surgisoft.diagnosis.refit import (
+    Job,
+    JointFit,
     RefitConfig,
+    Split,
     apart_mm,
     fit_together,
+    in_front,
     reason_to_refit,
     refit,
+    run_job,
 )
 from surgisoft.errors import InputError
 from surgisoft.measurement.fitting import fit
 from surgisoft.measurement.recordings import Recording, save_recording
 from surgisoft.surrogate.checkpoint import save_model
+from surgisoft.surrogate.effects import make_effect
 from surgisoft.surrogate.model import ArmModel, Validation
 
 PERIOD_S, LAG_S, NOISE_MM = 0.1, 0.4, 0.1
@@ -429,6 +438,31 @@ def test_command_and_python_say_the_same_and_amend_makes_the_error_fall(
     assert better.steps[0][0] == "line_lag"
     assert better.rounds[0].together
     assert better.claimed
+
+
+def test_what_effects_behind_the_network_do_is_not_learned_by_it(lagging):
+    """A frame that is 5 mm off belongs to its effect, and training leaves it there."""
+    recording, arm = lagging
+    turned = make_effect("misalignment", arm.facts)
+    turned.shift.data.copy_(torch.tensor([5.0, 0.0, 0.0]))
+    model = with_effect(copy.deepcopy(arm), "misalignment", turned).eval().requires_grad_(False)
+    moved = replace(recording, key_points_mm=recording.key_points_mm + np.array([5.0, 0.0, 0.0]))
+    split = Split.of(identification_problem(model, [moved]), SHORT)
+    trained = run_job(split, Job(model, (), None, 3, 0)).model
+    before, after = (split.losses(each).sum() for each in (model, trained))
+    assert after < 1.2 * before, "5 mm twice are 100 times the squared error"
+    assert in_front(["misalignment", "line_lag", "creep"]) == ["line_lag", "creep"]
+
+
+def test_a_joint_fit_keeps_the_parameters_of_effects_that_it_did_not_train(found):
+    def parameter(effect):
+        return Parameter(effect, "x", 1.0, 1.0, 1.0, "", True, (0.0, 2.0), "")
+
+    joint = JointFit(None, None, (parameter("line_lag"),), {"line_lag": "a lag"})
+    given = [parameter("payload"), parameter("line_lag")]
+    whole = joint.beside(given, {"payload": "a load", "line_lag": "another"})
+    assert [each.effect for each in whole.parameters] == ["payload", "line_lag"]
+    assert whole.in_words == {"payload": "a load", "line_lag": "a lag"}
 
 
 def test_a_network_that_needs_no_training_stays_as_it_is(problem, lagging, found, monkeypatch):

@@ -44,7 +44,8 @@ def amend(
             "--effect",
             metavar="NAME|FILE.py...",
             autocompletion=complete_effects,
-            help="Effects to add. An effect that the model has already is fitted again.",
+            help="Effects to add, separated by spaces or commas. An effect that the model has "
+            "already is fitted again.",
         ),
     ],
     data: Annotated[
@@ -97,7 +98,7 @@ def amend(
     from surgisoft.surrogate.effects import named_effect
 
     # Files of effects first: the model may hold one of them.
-    names = [named_effect(given) for given in effects]
+    names = [named_effect(name) for given in effects for name in given.split(",") if name]
     with progress("amend") as tell:
         stages = iter(range(100))
         result = amend_model(
@@ -148,7 +149,10 @@ def amend(
     if saved:
         print(f"wrote {output}: {result.model.summary()}")
         files = " ".join(map(str, data))
-        following = f"surgisoft diagnose {output} {files}{before_options(before, paired)}"
+        following = f"surgisoft diagnose {output} {files}"
+        if before:
+            given = before_options(before, paired)
+            following = f"surgisoft improve {model} {files}{given} -o OTHER"
         print(f"next, find further effects: {with_effect_files(following)}")
     else:
         print(f"{output} was not written; --anyway writes it nevertheless", flush=True)

@@ -115,6 +115,8 @@ def improve(
         given = (" ".join(map(str, some)) for some in (recordings, before or ()))
         found = result.diagnoses[-1]
         command = with_effect_files(found.command(str(last), *given)) if found.next_command else ""
+        # The new model describes the arm after the change, and not the one before.
+        command = "" if before and result.claimed else command
         written += write_improve_report(result, tables, report, title, command)
     if replay:
         written.append(write_before_and_after(result, tables, model.name, replay))
@@ -127,7 +129,8 @@ def improve(
     print(f"wrote {output}: {result.model.summary()}")
     if result.interrupted:
         files = " ".join(map(str, recordings))
-        again = f"surgisoft improve {output} {files}{before_options(before, paired)} -o OTHER"
+        start = model if before else output
+        again = f"surgisoft improve {start} {files}{before_options(before, paired)} -o OTHER"
         following = with_effect_files(again)
         print(f"next, to seek further effects: {following}")
         raise typer.Exit(INTERRUPTED)
@@ -142,6 +145,7 @@ def _show(result) -> None:
     for number, done in enumerate(result.rounds, 1):
         what = f"+ {done.step}" if done.step else "no further effect"
         what = "interrupted" if done.verdict == "interrupted" else what
+        what += ", in its best form beside the others" if done.anew else ""
         what += ", fitted together with the network" if done.together else ""
         competing = f" (or {', '.join(done.competing)})" if done.competing else ""
         print(f"round {number}: {done.verdict}: {done.sentence}")

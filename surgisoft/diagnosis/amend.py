@@ -18,7 +18,7 @@ from surgisoft.diagnosis.data_quality import FAR_ROWS, far_share
 from surgisoft.diagnosis.estimation.effects import fit_effects
 from surgisoft.diagnosis.estimation.intervals import Estimates, Parameter, beside_former
 from surgisoft.diagnosis.estimation.network import retune
-from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
+from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs, refuse_amended
 from surgisoft.diagnosis.other_models import name_of, open_model, refuse_predictions
 from surgisoft.diagnosis.pairs import Change, Paired, before_and_after
 from surgisoft.diagnosis.refit import Refit, apart_mm, can_hide, fit_together, refit_reason
@@ -336,7 +336,10 @@ def amend(
     both, earlier = None, []
     if before is not None:
         earlier = load_recordings(before)
+        refuse_amended(model, recordings, earlier)
         both = before_and_after(plain, earlier, paired).with_final_check()
+        if both.strange is not None:
+            raise InputError(both.strange_in_words)
         notes, table = (*notes, *both.notes_of_fit), both.table
     problem = table.training()
     names = list(dict.fromkeys(names))

@@ -53,6 +53,7 @@ from surgisoft.diagnosis.inputs import (
     Recordings,
     held_out_in_fit,
     open_inputs,
+    refuse_amended,
     with_known_residuals,
 )
 from surgisoft.diagnosis.other_models import open_model
@@ -356,10 +357,12 @@ def diagnose(
         before = reference
     both = None
     if before is not None:
-        both = before_and_after(table, load_recordings(before), paired)
+        earlier = load_recordings(before)
+        refuse_amended(model, whole, earlier)
+        both = before_and_after(table, earlier, paired)
         problem = both.training()
         # The sentence says it where nothing can be told.
-        notes = notes if both.strange is not None and not both.used else (*notes, *both.notes)
+        notes = notes if both.strange is not None else (*notes, *both.notes)
     else:
         problem = with_known_residuals(table.training(), reference)
     notes = (*notes, *thinning_notes(problem))
@@ -410,7 +413,7 @@ def diagnose_change(
     problem: training rows of the recordings after the change, as `BeforeAfter.training` poses them,
     of the given model or of one that was amended since.
     """
-    if both.strange is not None and not both.used:
+    if both.strange is not None:
         return without_before(both)
     found, not_testable = findings_of(problem, report, without)
     result = replace(result_of(found), not_testable=not_testable)

@@ -25,10 +25,10 @@ from surgisoft.diagnosis.estimation.intervals import (
     values_text,
 )
 from surgisoft.diagnosis.estimation.network import retune
-from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
+from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs, refuse_amended
 from surgisoft.diagnosis.other_models import name_of, open_model, refuse_predictions
 from surgisoft.diagnosis.pairs import Change, Paired, before_and_after
-from surgisoft.diagnosis.refit import JointFit, apart_mm, fit_together
+from surgisoft.diagnosis.refit import JointFit, apart_mm, fit_together, in_front
 from surgisoft.diagnosis.residuals import Sealed, model_discrepancy, residual_table
 from surgisoft.diagnosis.setup import find_setup_faults
 from surgisoft.errors import InputError, Interrupted
@@ -80,6 +80,8 @@ class Round:
     """RMS distance on the held-out rows after the round, known when all rounds have ended, mm."""
     together: bool = False
     """Whether the effect was fitted together with the whole network."""
+    anew: bool = False
+    """Whether it is an effect of a former round, of which another form was sought."""
 
     def to_json(self) -> dict:
         """Plain values; see `FORMER_KEYS` for deprecated names."""
@@ -166,7 +168,7 @@ class Improvement:
         """The outcome in words."""
         if not self.steps:
             return f"nothing was added: {self.rounds[-1].sentence}"
-        names, fall = " + ".join(name for name, _ in self.steps), self.held_out
+        names, fall = " + ".join(dict.fromkeys(name for name, _ in self.steps)), self.held_out
         if self.claimed and fall.in_fit:
             where = f"on rows of which the given model had been fitted to {fall.in_fit:.0%}"
             return (
@@ -187,7 +189,7 @@ class Improvement:
             "sentence": self.sentence,
             "claimed": self.claimed,
             "interrupted": self.interrupted,
-            "effects": [name for name, _ in self.steps if name != NETWORK],
+            "effects": [name for name in dict(self.steps) if name != NETWORK],
             "network_retuned": any(name == NETWORK for name, _ in self.steps),
             "error_mm": self.held_out.to_json(),
             "rounds": [each.to_json() for each in self.rounds],
@@ -255,6 +257,7 @@ def improve(
                 "then is explained, which the network never saw; leave out one of the two"
             )
         earlier = load_recordings(before)
+        refuse_amended(model, recordings, earlier)
         both = before_and_after(table, earlier, paired).with_final_check()
         # Named by the change, which residuals tell without pairs, and fitted to the residuals.
         notes = (*notes, *dict.fromkeys((*both.notes, *both.notes_of_fit)))
@@ -264,6 +267,7 @@ def improve(
     made, rounds = [_Made(model, known)], []
     diagnoses: list[Diagnosis] = []
     added: list[str] = []
+    anew: list[str] = []  # of these, what was fitted in another form
 
     def note(done: Round) -> None:
         rounds.append(done)
@@ -285,6 +289,28 @@ def improve(
             setup_tests=not added,
         )
 
+    def in_another_form(found: Diagnosis, current: Round) -> bool:
+        """Fit an effect anew that was added before and is named again; whether that helps.
+
+        Its form was chosen while others were missing, and another form may now do more.
+        """
+        again = [name for name in found.verdict.effects if name in added and name not in anew]
+        if not again:
+            return False
+        name = again[0]
+        anew.append(name)
+        model, posed = made[-1].model, problem.with_model(made[-1].model)
+        less = {key: effect for key, effect in model.effects.items() if key != name}
+        others = [key for key in added if key != name]
+        without = problem.with_model(model.replace(effects=less))
+        fitted = fit_effects(without, [*others, name])
+        fall = fall_of(posed, problem.with_model(fitted.model))
+        if _doubt(name, fall, fitted.parameters):
+            return False
+        made.append(_Made(fitted.model, made[-1].known, fitted.parameters, fitted.in_words))
+        note(replace(_step(current, name, found, fall.after), anew=True))
+        return True
+
     def add_effects() -> None:
         nonlocal problem
         going, trained = True, False  # whether the network was trained on these rows
@@ -293,7 +319,7 @@ def improve(
             diagnoses.append(found)
             error = fall_of(problem, problem.with_model(made[-1].model)).after
             current = Round(found.verdict.kind, found.verdict.sentence, None, (), None, error)
-            names = [name for name in next_effects(found) if name not in added]
+            names = next_effects(found, added)
             going = False
             for name in names[: most_effects - len(added)]:
                 posed = problem.with_model(made[-1].model)
@@ -304,7 +330,9 @@ def improve(
                     together = plain_mm is None or plain_mm > found.refit.of(name).heldout_rmse_mm
                 if found.refit is not None and together:
                     validated = found.refit.of(name)
-                    fitted = fit_together(posed, [*added, name], validated, progress=refit_progress)
+                    trained_with = [*in_front(added), name]
+                    fitted = fit_together(posed, trained_with, validated, progress=refit_progress)
+                    fitted = fitted.beside(made[-1].parameters, made[-1].in_words)
                 else:
                     fitted = fit_effects(posed, [*added, name])
                 fall = fall_of(posed, problem.with_model(fitted.model))
@@ -334,6 +362,8 @@ def improve(
                 made.append(_Made(fitted.model, known, fitted.parameters, fitted.in_words))
                 note(replace(_step(current, name, found, fall.after), together=together))
                 current = replace(current, sentence=f"named beside {name} by the same diagnosis")
+            if not going and not names:
+                going = in_another_form(found, current)
             if not going:
                 note(current)
         tuned = retune(made[-1].model, problem, added) if added and both is None else None
@@ -393,18 +423,23 @@ def improve(
     return result
 
 
-def next_effects(found: Diagnosis) -> tuple[str, ...]:
+def next_effects(found: Diagnosis, added: Sequence[str] = ()) -> tuple[str, ...]:
     """The effects to add after a diagnosis, in order; none where the loop ends.
 
-    Of effects that cannot be told apart the first is taken: the error falls with any of them. Where
-    a diagnosis cannot tell, but an effect of the list is more likely missing than not, the most
-    probable one is tried: it stays only if the error falls by it.
+    Of effects that cannot be told apart the first is taken that was not added before: the error
+    falls with any of them. Where the first diagnosis cannot tell, but an effect of the list is more
+    likely missing than not, the most probable one is tried: it stays only if the error falls by it.
+    Later ones that cannot tell end the loop: what an added effect's formula gets wrong looks as
+    much like another effect (docs/results/improve.md).
+
+    added: effects of former rounds.
     """
-    kind, effects = found.verdict.kind, found.verdict.effects
-    chances = found.probabilities
-    if kind == "cannot_tell" and chances is not None and chances.known > LIKELY:
+    kind, chances = found.verdict.kind, found.probabilities
+    effects = found.verdict.effects
+    if kind == "cannot_tell" and not added and chances is not None and chances.known > LIKELY:
         return tuple(chances.effects)[:1]
-    return effects[:1] if kind == "ambiguous" else effects
+    left = tuple(name for name in effects if name not in added)
+    return left[:1] if kind == "ambiguous" else left
 
 
 def _as_good(held: Fall, free: Fall) -> bool:

@@ -71,6 +71,26 @@ def seen_in_fit(model: ArmModel, recordings: Iterable[Recording]) -> list[Seen]:
     ]
 
 
+def refuse_amended(
+    model: ArmModel, recordings: Iterable[Recording], before: Iterable[Recording]
+) -> None:
+    """Raise InputError where effects of the model were fitted to recordings after a change that are
+    to be compared with those before it.
+
+    Such a model predicts both sides with these effects, so all that was explained would be found
+    once more.
+    """
+    recordings = list(recordings)
+    for recording, seen in zip(recordings, seen_in_fit(model, recordings), strict=True):
+        if "amended" in seen.shares:
+            names = " + ".join(each.name for each in before)
+            raise InputError(
+                f"{recording.label}: {seen.words}, expected a model from before the change: "
+                f"compared with {names}, what these effects explain would be found again; leave "
+                "out --before, or give the model that was amended to 'surgisoft improve'"
+            )
+
+
 def refuse_rows_of_fit(model: ArmModel, recordings: Iterable[Recording]) -> None:
     """Raise InputError unless the recordings are known to have taken no part in the model's fit."""
     recordings = list(recordings)

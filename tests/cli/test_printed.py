@@ -245,7 +245,7 @@ def test_diagnose_prints_candidates_and_the_next_step(bench, capsys, monkeypatch
     assert "check: the clock is even\n" in out
     assert re.search(r"creep +0\.90 +50\.0% +25\.0% +0\.1500 \[0\.1000, 0\.2000\] mm", out)
     assert "not testable: drift: too short" in out
-    assert "not ranked: payload, twist (their parameters would be implausible)" in out
+    assert "not ranked, because of implausible parameters: payload, twist" in out
     assert "fitted together with the network, because a lag is close:" in out
     assert re.search(r"lag .*\[0\.0100, 0\.0200\] mm +0\.0100  implausible parameters\n", out)
     assert "not tried, because steady-state samples cannot show them: leak\n" in out
@@ -306,10 +306,10 @@ def test_amend_and_improve_write_nothing_where_nothing_is_claimed(
 ):
     rec, new, numbers = (str(p) for p in (bench / "bench.parquet", tmp_path / "n", tmp_path / "j"))
     rounds = [
-        SimpleNamespace(step="creep", together=True, competing=("leak",), verdict="identified",
-                        sentence="creep is missing", error_training_mm=0.2),
-        SimpleNamespace(step=None, together=False, competing=(), verdict="nothing_missing",
-                        sentence="it fits", error_training_mm=0.2),
+        SimpleNamespace(step="creep", together=True, anew=False, competing=("leak",),
+                        verdict="identified", sentence="creep is missing", error_training_mm=0.2),
+        SimpleNamespace(step=None, together=False, anew=False, competing=(),
+                        verdict="nothing_missing", sentence="it fits", error_training_mm=0.2),
     ]  # fmt: skip
     found = result(
         claimed=False, rounds=rounds, steps=[("creep", 0.3)], parameters=[PARAMETER, UNITLESS],
@@ -601,12 +601,12 @@ def test_what_is_claimed_is_written_with_its_page(bench, tmp_path, capsys, monke
     again = ["amend", "default", "--effect", "creep", "--data", rec, "-o", new, "--force"]
     target, after = (
         "surgisoft.diagnosis.amend.amend",
-        f"surgisoft diagnose {new} {rec} --before {rec}",
+        f"surgisoft improve default {rec} --before {rec}",
     )
     out = printed(capsys, monkeypatch, target, found, *again, "--before", rec)
-    assert out.endswith(f"{after}\n")
+    assert out.endswith(f"{after} -o OTHER\n")
     out = printed(capsys, monkeypatch, target, found, *again, "--before", rec, "--paired", "never")
-    assert out.endswith(f"{after} --paired never\n")
+    assert out.endswith(f"{after} --paired never -o OTHER\n")
 
 
 def test_an_import_names_what_looks_wrong(bench, tmp_path, capsys, monkeypatch):

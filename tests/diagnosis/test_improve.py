@@ -18,6 +18,7 @@ from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.report import Text
 from surgisoft.surrogate.checkpoint import load_model, save_model
+from surgisoft.surrogate.model import ArmModel
 from tests.diagnosis.synthetic import NOISE_MM
 from tests.diagnosis.test_estimation import TRUTHS, bare_arm, measured_on, with_truth
 from tests.diagnosis.test_estimation import rms as rms_distance
@@ -163,19 +164,61 @@ def test_the_loop_ends_when_an_effect_is_named_again_or_enough_were_added(recite
         improve(bare_arm(), [recording], most_effects=0)
 
 
+def yielding() -> ArmModel:
+    """Gains that differ, and a holder that yields as the cube root of the time."""
+    arm = with_truth("gain_mismatch", {"gain": [0.12, -0.08, -0.02]})
+    strengths = {"turn": [0.03, -0.02, 0.0], "log_tau": 9.0, "log_power": math.log(0.35)}
+    return with_truth("drift", strengths, arm, kind="base", power=0.35)
+
+
+def test_the_form_of_an_effect_is_chosen_beside_the_others(recited):
+    """Gains that were fitted alone have taken over some of the drift, and what is left looks like
+    gains that drift."""
+    recited(said("identified", "gain_mismatch"), said("identified", "drift"), said("cannot_tell"))
+    result = improve(bare_arm(), [measured_on(yielding())])
+    assert [r.step for r in result.rounds if r.step != NETWORK] == ["gain_mismatch", "drift", None]
+    assert result.model.effects["drift"].kind == "base"
+    assert result.held_out.after < 1.15 * math.sqrt(3) * NOISE_MM
+
+
+def test_an_effect_that_is_named_again_is_sought_in_another_form(recited, monkeypatch):
+    """A first drift in the form of gains is exchanged for one of the base."""
+    drifting = with_truth("drift", {"gain": [0.05, 0.0, 0.0]}, kind="actuation")
+    fit_effects = loop.fit_effects
+
+    def first_in_a_wrong_form(problem, names):
+        monkeypatch.setattr(loop, "fit_effects", fit_effects)
+        return replace(fit_effects(problem.with_model(drifting), names), refitted=())
+
+    monkeypatch.setattr(loop, "fit_effects", first_in_a_wrong_form)
+    recited(*[said("identified", "drift")] * 3)
+    truth = with_truth("drift", {"turn": [0.03, -0.02, 0.0], "log_tau": 6.5}, kind="base")
+    result = improve(bare_arm(), [measured_on(truth)])
+    done = [(r.step, r.anew) for r in result.rounds if r.step != NETWORK]
+    assert done == [("drift", False), ("drift", True), (None, False)]
+    assert result.model.effects["drift"].kind == "base"
+    assert result.to_json()["effects"] == ["drift"]
+    assert result.sentence.startswith("drift: error reduced")
+
+
 def test_what_a_diagnosis_leads_to():
     assert next_effects(said("nothing_missing")) == ()
     assert next_effects(said("unknown_effect")) == ()
     assert next_effects(said("identified", "creep")) == ("creep",)
     assert next_effects(said("several", "creep", "payload")) == ("creep", "payload")
     assert next_effects(said("ambiguous", "creep", "drift")) == ("creep",)
+    assert next_effects(said("ambiguous", "creep", "drift"), ["creep"]) == ("drift",)
+    assert next_effects(said("several", "creep", "payload"), ["payload"]) == ("creep",)
+    assert next_effects(said("identified", "creep"), ["creep"]) == ()
     assert next_effects(said("cannot_tell")) == ()
 
 
 def test_what_is_more_likely_missing_than_not_is_tried():
     for known, tried in ((0.6, ("creep",)), (0.4, ())):
         chances = Probabilities(0.0, 0.0, 1 - known, {"creep": known - 0.1, "drift": 0.1}, 0.0, ())
-        assert next_effects(replace(said("cannot_tell"), probabilities=chances)) == tried
+        unsure = replace(said("cannot_tell"), probabilities=chances)
+        assert next_effects(unsure) == tried
+        assert next_effects(unsure, ["payload"]) == (), "in the first round alone"
 
 
 def test_rounds_are_reported_as_they_end(recited):

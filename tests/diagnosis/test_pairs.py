@@ -519,6 +519,45 @@ def test_a_model_that_does_not_describe_before_does_not_blame_after(model, tmp_p
     assert "<h2>Effects" not in (tmp_path / "page" / "diagnosis.html").read_text()
 
 
+def test_a_model_that_does_not_describe_before_is_no_reference_for_pairs_either(model):
+    """The same motion before, of another arm: the difference is no change of this one."""
+    after = made(smooth_walk(10), 0.0)
+    swing = 40.0 * (after.measured - after.measured.mean(0)) @ np.array([1.0, -1.0])
+    points = after.key_points_mm + swing[:, None, None] * np.array([1.0, 0.0, 0.0])
+    before = replace(after, key_points_mm=points, name="other")
+    found = diagnose(model, [after], before=[before])
+    assert found.change is not None
+    assert found.change.paired_share > 0.9
+    assert (found.verdict.kind, found.verdict.reason) == ("cannot_tell", "before")
+    with pytest.raises(InputError, match="the model does not describe other"):
+        amend(model, [after], ["misalignment"], before=[before])
+
+
+def test_what_was_amended_is_not_sought_again_since_before(model, tmp_path, capsys):
+    """A model that has the change would predict it before the change, too."""
+    before = made(smooth_walk(10), 0.0)
+    after = made(smooth_walk(10), 2.0, seed=7, name="later")
+    amended = amend(model, [after], ["misalignment"], before=[before]).model
+    save_model(amended, tmp_path / "new")
+    for each in (before, after):
+        save_recording(each, tmp_path / f"{each.name}.parquet")
+    new, later, earlier = (
+        str(tmp_path / name) for name in ("new", "later.parquet", f"{before.name}.parquet")
+    )
+    for command in (
+        ["diagnose", new, later],
+        ["amend", new, "--effect", "payload", "--data", later, "-o", str(tmp_path / "other")],
+        ["improve", new, later, "-o", str(tmp_path / "other")],
+    ):
+        assert run([*command, "--before", earlier]) == 2
+        error = capsys.readouterr().err
+        assert "effects of the model were fitted to " in error
+        assert "from before the change" in error
+        assert error.count("\n") == 1
+    assert not (tmp_path / "other").exists()
+    assert run(["diagnose", new, later]) == 0
+
+
 def test_the_amendment_of_such_a_change_is_warned_of(model):
     after, before = strange_before(model, smooth_walk(10))
     both = before_and_after(residual_table(model, [after]), [before])

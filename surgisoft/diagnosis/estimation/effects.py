@@ -2,7 +2,7 @@
 
 import copy
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -73,9 +73,10 @@ def fit_effects(problem: Problem, names: list[str]) -> Fitted:
     names = list(dict.fromkeys(names))
     refitted = tuple(name for name in names if name in model.effects)
     others: list[Fit] = []
-    for name in names:
+    for position, name in enumerate(names):
         if name not in model.effects:
-            model, *more = _added(problem.with_model(model), name)
+            beside = [each for each in names[:position] if not is_large(model.effects[each])]
+            model, *more = _added(problem.with_model(model), name, beside)
             if len(names) == 1 and more:
                 model, others = _best_end(problem, name, [model, *more])
     large = [name for name in names if is_large(model.effects[name])]
@@ -192,29 +193,36 @@ def is_large(effect: Effect) -> bool:
     return _values(effect) > LARGE
 
 
-def _added(problem: Problem, name: str) -> list[ArmModel]:
+def _added(problem: Problem, name: str, beside: Sequence[str] = ()) -> list[ArmModel]:
     """The problem's model with one effect more, roughly fitted from a few starts, the best first.
 
     Of two that come to nearly the same, the simpler one is the best.
+
+    beside: effects of the model that are fitted with it. Fitted alone before, they have taken over
+    some of what the new one does, and a form of it that does something else would then seem best.
     """
     tried = []
-    for model in starts(problem, name, STARTS):
+    for model in starts(problem, name, STARTS, every_form=True):
         effect = model.effects[name]
         if is_large(effect):
             misfit = fit_amplitudes(model, problem, name).misfit
         else:
-            misfit = fit_all(model, problem, [name], FIRST_ITERATIONS).misfit
+            misfit = fit_all(model, problem, [*beside, name], FIRST_ITERATIONS).misfit
         values = sum(p.numel() for p in effect.amplitudes().values())
         tried.append((misfit * (1.0 + SEARCH.amplitude_price) ** values, model))
     models = [model for _, model in sorted(tried, key=lambda one: one[0])]
     return models[:1] if is_large(models[0].effects[name]) else models
 
 
-def starts(problem: Problem, name: str, number: int = 2) -> list[ArmModel]:
+def starts(
+    problem: Problem, name: str, number: int = 2, every_form: bool = False
+) -> list[ArmModel]:
     """Models with the named effect in its best few candidates, amplitudes fitted; parts are copies.
 
     The candidates are ranked by the error that each leaves on held-out blocks beside the model
     discrepancy; of two that leave nearly the same, the simpler one comes first.
+
+    every_form: whether the best candidate of each other form (`Effect.config`) is a start, too.
     """
     tried = model_candidates(problem, [name])
     if not tried:
@@ -230,8 +238,12 @@ def starts(problem: Problem, name: str, number: int = 2) -> list[ArmModel]:
     gains = [np.log(before / validation.losses(pick).sum()) for pick in picks]
     selection = SEARCH
     scores = [selection.priced(gain, len(pick)) for gain, pick in zip(gains, picks, strict=True)]
+    order = [int(place) for place in np.argsort(scores)[::-1]]
+    chosen, forms = order[:number], [tried[place].effect.config() for place in order]
+    if every_form:
+        chosen += [p for at, p in enumerate(order) if at >= number and forms[at] not in forms[:at]]
     models = []
-    for best in np.argsort(scores)[::-1][:number]:
+    for best in chosen:
         effect = copy.deepcopy(tried[best].effect)
         amplitudes = torch.from_numpy(validation.amplitudes(picks[best])).float()
         begin = 0

@@ -1,9 +1,9 @@
 """Fall of the error by `amend` on generators of robots that took no part in the decision's fit.
 
     python -m benchmarks.amended_cases chain=FOLDER elastica=FOLDER [--models FOLDER]
-        [--pairs] [--improve] [--log FILE]
+        [--pairs] [--improve [--before]] [--log FILE]
 
-FOLDER holds the cases of `benchmarks.chain_cases` or `benchmarks.elastica_cases`. The decision in
+FOLDER holds the cases of the generator that the name begins with (`GENERATORS`). The decision in
 force judges the stored evidence of each case (`benchmarks/decision/evidence/judged`); a source that
 the decision was fitted to is judged by a fit without it. Where one effect is missing that changes
 the key points by at least the model's validated error, and the decision names something, the
@@ -15,7 +15,8 @@ The oracle is the error of the same model on the same robot, schedule and noise 
 that by `amend`, 0 where it claims none, and that by taking the effect out of the robot.
 
 With `--improve` nothing has to be named: every such case goes through
-`surgisoft improve MODEL --data AFTER --refit never`, which repeats diagnosis and amendment.
+`surgisoft improve MODEL AFTER --refit never`, which repeats diagnosis and amendment; with
+`--before` through `surgisoft improve MODEL AFTER --before BEFORE`.
 """
 
 import argparse
@@ -28,7 +29,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks import chain_cases, elastica_cases
+from benchmarks import chain_cases, elastica_cases, lattice_cases, strain_rod_cases
 from benchmarks.decision.evidence_log import (
     EVIDENCE,
     JUDGED,
@@ -50,8 +51,13 @@ from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.model import ArmModel
 
-GENERATORS = {"chain": chain_cases.GENERATOR, "elastica": elastica_cases.GENERATOR}
-"""Generators by the first word of the name of their evidence."""
+GENERATORS = {
+    "chain": chain_cases.GENERATOR,
+    "elastica": elastica_cases.GENERATOR,
+    "lattice": lattice_cases.GENERATOR,
+    "strain_rod": strain_rod_cases.GENERATOR,
+}
+"""Generators by the beginning of the name of their evidence."""
 
 
 @dataclass(frozen=True)
@@ -130,12 +136,18 @@ def worth_of(
     return amended(model, recording, plain, named, before)
 
 
-def worth_of_improve(generator: Generator, folder: Path, models: Path, case: Labelled) -> Amended:
-    """Improve the model of a case's robot, and compare with the oracle."""
+def worth_of_improve(
+    generator: Generator, folder: Path, models: Path, case: Labelled, before: bool = False
+) -> Amended:
+    """Improve the model of a case's robot, and compare with the oracle.
+
+    before: whether `improve` is given the recordings from before the change.
+    """
     model, recording, plain = _opened(generator, folder, models, case)
-    found = improve(model, [recording], refit="never")
-    fall = found.held_out
-    added = tuple(name for name, _ in found.steps if name != NETWORK)
+    earlier = load_recordings(robot_folder(folder, case.robot) / "before") if before else None
+    found = improve(model, [recording], refit="never", before=earlier)
+    fall = found.model_error or found.held_out
+    added = tuple(name for name in dict(found.steps) if name != NETWORK)
     after = fall.after if found.claimed else fall.before
     return Amended(added, fall.before, after, amended(model, recording, plain, ()).oracle)
 
@@ -156,15 +168,20 @@ def _opened(
 def markdown(some: dict[str, list[AmendedCase]]) -> str:
     """The tables: shares of each source, and each case."""
     lines = [
-        "| source | cases | share of the oracle's fall, median | pooled | amended by what is "
-        "missing alone | their median | pooled |",
-        "|---|---|---|---|---|---|---|",
+        "| source | cases | all that is missing added | and nothing else | nothing added | of them "
+        "shown in the held-out rows | share of the oracle's fall, median | pooled | amended by "
+        "what is missing alone | their median | pooled |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
-    for source, worths in some.items():
+    together = [worth for worths in some.values() for worth in worths]
+    for source, worths in (some | {"together": together} if len(some) > 1 else some).items():
         shown = [w for w in worths if w.amended.before >= SHOWS * w.amended.oracle]
         right = [w for w in shown if w.right]
+        whole = sum(set(w.truth) <= set(w.amended.effects) for w in worths)
+        none = sum(not w.amended.effects for w in worths)
         lines.append(
-            f"| {source} | {len(shown)} | {_shares(shown)} | {len(right)} | {_shares(right)} |"
+            f"| {source} | {len(worths)} | {whole} | {sum(w.right for w in worths)} | {none} | "
+            f"{len(shown)} | {_shares(shown)} | {len(right)} | {_shares(right)} |"
         )
     lines += [
         "",
@@ -215,12 +232,13 @@ def main() -> None:
     parser.add_argument("--log", type=Path, default=Path("runs/amended-cases.jsonl"))
     parser.add_argument("--pairs", action="store_true", help="cases of two effects")
     parser.add_argument("--improve", action="store_true", help="`improve` in place of `amend`")
+    parser.add_argument("--before", action="store_true", help="`improve` with --before")
     given = parser.parse_args()
     torch.set_num_threads(1)
     done, answer = read_log(given.log), dict[str, list[AmendedCase]]()
     given.log.parent.mkdir(parents=True, exist_ok=True)
     for name, _, folder in (each.partition("=") for each in given.cases):
-        generator = GENERATORS[name.partition("_")[0]]
+        generator = next(own for kind, own in GENERATORS.items() if name.startswith(kind))
         answer[name] = []
         pick = to_improve if given.improve else to_amend
         wanted = pick(statements(name), 2 if given.pairs else 1)
@@ -228,7 +246,10 @@ def main() -> None:
             one = done.get((name, case.case))
             if one is None or one.kind != kind or (named and one.amended.effects != named):
                 place = generator, Path(folder), given.models, case
-                result = worth_of_improve(*place) if given.improve else worth_of(*place, named)
+                if given.improve:
+                    result = worth_of_improve(*place, given.before)
+                else:
+                    result = worth_of(*place, named)
                 one = AmendedCase(case.case, case.truth, kind, result)
                 with given.log.open("a") as file:
                     file.write(json.dumps({"source": name} | dataclasses.asdict(one)) + "\n")

@@ -93,7 +93,7 @@ def test_shares_of_the_oracle():
         AmendedCase("d", ("creep",), "identified", Amended((), 0.3, 0.3, 0.3)),
     ]
     rows = markdown({"chain": worth}).splitlines()
-    assert rows[2] == "| chain | 2 | 70 % | 60 % | 1 | 90 % | 90 % |"
+    assert rows[2] == "| chain | 4 | 2 | 2 | 1 | 2 | 70 % | 60 % | 1 | 90 % | 90 % |"
     cells = [row.split("|")[-2].strip() for row in rows if row.startswith("| chain | ")][1:]
     assert sorted(cells) == ["-", "-", "50 %", "90 %"]
 

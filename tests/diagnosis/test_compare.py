@@ -180,7 +180,9 @@ def test_a_tip_that_was_never_seen_is_null_not_nan():
 
 
 def test_commanded_actuation_must_be_there():
-    with pytest.raises(InputError, match="add these columns, or fit a model with --actuation measured"):
+    with pytest.raises(
+        InputError, match="add these columns, or fit a model with --actuation measured"
+    ):
         arm_spec([recording(np.tile(POINTS, (3, 1, 1)))], "commanded")
 
 

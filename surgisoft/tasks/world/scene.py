@@ -28,7 +28,7 @@ from surgisoft.tasks.world.arm import ArmPart, LoneArm, Randomisation
 from surgisoft.tasks.world.pytree import overwritable
 from surgisoft.tasks.world.random_streams import Stream
 from surgisoft.tasks.world.respiration import Breaths, OrganMotion, Respiration
-from surgisoft.tasks.world.treatment import Plan, rings
+from surgisoft.tasks.world.treatment import Plan, rings, treatment_of
 
 GEOMETRIES = ("batched", "fcl")
 """Collision engines: `batched` for training, `fcl` exact."""
@@ -157,7 +157,7 @@ class SceneEngine:
         self.camera = spec.camera.camera()
         self.beam_mm = spec.laser.standoff_mm[1] + BEAM_BEYOND_MM
         self.organ = scene.bodies.index(scene.organ)
-        treated = (plan or rings)(scene, vary, config.band_mm, config.view_points)
+        treated = treatment_of(plan or rings, scene, vary, config.band_mm, config.view_points)
         self.work_camera = self.camera
         if treated.field_rad is not None:
             narrow = min(treated.field_rad, self.camera.fov_rad)

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -76,6 +77,38 @@ class Treatment:
 
 Plan = Callable[[Scene, Randomisation, float, int], Treatment]
 """(scene, what is randomised, band of a path in mm, points to be seen) -> what is to be treated."""
+
+
+@dataclass(frozen=True)
+class _Planned:
+    """What a treatment follows from, equal for scenes of equal content."""
+
+    plan: Plan
+    content: str
+    vary: Randomisation
+    band_mm: float
+    view_points: int
+    scene: Scene = field(compare=False)
+
+
+@lru_cache(maxsize=8)
+def _of_planned(what: _Planned) -> Treatment:
+    return what.plan(what.scene, what.vary, what.band_mm, what.view_points)
+
+
+def treatment_of(
+    plan: Plan, scene: Scene, vary: Randomisation, band_mm: float, view_points: int
+) -> Treatment:
+    """What a plan treats; a few are kept, so that the next environment of a scene is made sooner.
+
+    Its arrays are shared, and not to be changed.
+    """
+    what = _Planned(plan, scene.content_hash, vary, band_mm, view_points, scene)
+    try:
+        hash(what)
+    except TypeError:  # a plan of the user's own may have no hash
+        return plan(scene, vary, band_mm, view_points)
+    return _of_planned(what)
 
 
 def rings(scene: Scene, vary: Randomisation, band_mm: float, view_points: int) -> Treatment:

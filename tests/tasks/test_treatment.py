@@ -7,7 +7,6 @@ import pytest
 
 from surgisoft.scene.folder import open_scene
 from surgisoft.scene.spec import PHANTOM
-from surgisoft.tasks.world import treatment
 from surgisoft.tasks.world.arm import Randomisation
 from surgisoft.tasks.world.scene import NOT_RANDOMISED
 from surgisoft.tasks.world.treatment import rings, treatment_of
@@ -16,7 +15,7 @@ BAND_MM, POINTS = 2.0, 24
 
 
 @pytest.fixture
-def counted(monkeypatch):
+def counted():
     """A plan of rings that counts how often it is asked."""
     asked = []
 
@@ -24,7 +23,6 @@ def counted(monkeypatch):
         asked.append(scene.spec.lesion.diameter_mm)
         return rings(scene, vary, band_mm, view_points)
 
-    treatment._of_planned.cache_clear()
     return plan, asked
 
 

@@ -429,15 +429,18 @@ def next_effects(found: Diagnosis, added: Sequence[str] = ()) -> tuple[str, ...]
     Of effects that cannot be told apart the first is taken that was not added before: the error
     falls with any of them. Where the first diagnosis cannot tell, but an effect of the list is more
     likely missing than not, the most probable one is tried: it stays only if the error falls by it.
-    Later ones that cannot tell end the loop: what an added effect's formula gets wrong looks as
-    much like another effect (docs/results/improve.md).
+    Later that one itself has to be more likely missing than not: what an added effect's formula
+    gets wrong looks as much like another effect (docs/results/decision.md#two-effects-and-improve).
 
     added: effects of former rounds.
     """
     kind, chances = found.verdict.kind, found.probabilities
     effects = found.verdict.effects
-    if kind == "cannot_tell" and not added and chances is not None and chances.known > LIKELY:
-        return tuple(chances.effects)[:1]
+    if kind == "cannot_tell" and chances is not None:
+        first = next(iter(chances.effects), None)
+        if first is None or first in added:
+            return ()
+        return (first,) if (chances.effects[first] if added else chances.known) > LIKELY else ()
     left = tuple(name for name in effects if name not in added)
     return left[:1] if kind == "ambiguous" else left
 

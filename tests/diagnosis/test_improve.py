@@ -218,7 +218,11 @@ def test_what_is_more_likely_missing_than_not_is_tried():
         chances = Probabilities(0.0, 0.0, 1 - known, {"creep": known - 0.1, "drift": 0.1}, 0.0, ())
         unsure = replace(said("cannot_tell"), probabilities=chances)
         assert next_effects(unsure) == tried
-        assert next_effects(unsure, ["payload"]) == (), "in the first round alone"
+        assert next_effects(unsure, ["payload"]) == (), "less likely than not by itself"
+    chances = Probabilities(0.0, 0.0, 0.3, {"creep": 0.6, "drift": 0.1}, 0.0, ())
+    likely = replace(said("cannot_tell"), probabilities=chances)
+    assert next_effects(likely, ["payload"]) == ("creep",)
+    assert next_effects(likely, ["creep"]) == ()
 
 
 def test_rounds_are_reported_as_they_end(recited):

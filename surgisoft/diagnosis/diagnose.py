@@ -47,6 +47,7 @@ from surgisoft.diagnosis.decision import (
 from surgisoft.diagnosis.design.next_experiment import Experiment, Recommendation, recommend
 from surgisoft.diagnosis.design.schedules import SETUPS
 from surgisoft.diagnosis.error_axes import shares
+from surgisoft.diagnosis.estimation.intervals import values_text
 from surgisoft.diagnosis.evidence import Evidence, evidence_of
 from surgisoft.diagnosis.inputs import (
     Model,
@@ -76,7 +77,7 @@ from surgisoft.measurement.histories import check_fits
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
-from surgisoft.surrogate.effects import hypothesis_of, in_words, known_effects
+from surgisoft.surrogate.effects import Effect, hypothesis_of, in_words, known_effects
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.workers import torch_threads
 
@@ -777,6 +778,7 @@ def _ranked(found: Findings, score: Score, decision: Decision) -> Ranked:
     sure = chances.effects.get(score.effect, 0.0)
     effect = selection.in_best_form(score, _beside(found, score, decision))
     named = effect is not None and score.effect in decision.effects
+    less = named and selection.taken_away(score.option)
     if score.effect in chances.two:
         sure = max(sure, chances.pair)
     return Ranked(
@@ -789,7 +791,26 @@ def _ranked(found: Findings, score: Score, decision: Decision) -> Ranked:
         p_value=float(score.p_value),
         log_gain=float(score.log_gain.mean()),
         parameters={} if effect is None else {q.name: q.value for q in effect.quantities()},
-        in_words=in_words(effect.readings(found.problem.covered_s)) if effect and named else "",
+        in_words=estimate_in_words(effect, found.problem.covered_s, less)
+        if effect and named
+        else "",
+    )
+
+
+def estimate_in_words(effect: Effect, seconds: float | None, less: bool = False) -> str:
+    """What first estimates mean in words, and which of them is beyond its plausible range.
+
+    seconds: duration of the recordings, s. less: whether the effect acts less than before, so that
+    its amplitudes have the other sign.
+    """
+    text = in_words(effect.readings(seconds))
+    wrong = [each for each in effect.quantities() if not each.plausible]
+    if not text or not wrong or less:
+        return text
+    one = wrong[0]
+    return (
+        f"{text} (not plausible: {one.name} = {values_text(one.value)}, expected "
+        f"{values_text(one.low)} to {values_text(one.high)})"
     )
 
 

@@ -8,10 +8,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from surgisoft.cli import run
 from surgisoft.diagnosis.candidates import candidates
-from surgisoft.diagnosis.diagnose import amplitudes_that_vary, diagnose, knock, would_explain
+from surgisoft.diagnosis.diagnose import (
+    amplitudes_that_vary,
+    diagnose,
+    estimate_in_words,
+    knock,
+    would_explain,
+)
 from surgisoft.diagnosis.inputs import identification_problem
 from surgisoft.diagnosis.residuals import Floor, held_out_rows, residual_table
 from surgisoft.diagnosis.testability import DETECTED
@@ -20,6 +27,7 @@ from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, load_model, load_training_residuals
+from surgisoft.surrogate.effects import make_effect
 from surgisoft.surrogate.effects.contact import LEAST_SHARE
 
 
@@ -343,3 +351,15 @@ def test_the_final_check_sees_the_held_out_rows_alone():
     check = residual_table(default_arm(), [recording]).final_check()
     np.testing.assert_array_equal(check.index.numpy(), np.flatnonzero(held))
     assert np.isnan(check.table.measured_mm[~held]).all()
+
+
+def test_a_first_estimate_beyond_its_plausible_range_is_said_to_be_so():
+    """More than the whole of a change cannot lag; what acts less than before has the other sign."""
+    lag = make_effect("line_lag", default_arm().facts)
+    with torch.no_grad():
+        lag.share.fill_(0.9)
+        assert "not plausible" not in estimate_in_words(lag, 600.0)
+        lag.share.fill_(1.3)
+    words = estimate_in_words(lag, 600.0)
+    assert words.endswith(" (not plausible: share = 1.3, expected 0 to 1.05)")
+    assert "not plausible" not in estimate_in_words(lag, 600.0, less=True)

@@ -77,13 +77,22 @@ from surgisoft.measurement.histories import check_fits
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
-from surgisoft.surrogate.effects import Effect, hypothesis_of, in_words, known_effects
+from surgisoft.surrogate.effects import (
+    Effect,
+    Quantity,
+    hypothesis_of,
+    in_words,
+    known_effects,
+)
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.workers import torch_threads
 
 MOST_RIVALS = SEARCH.most_refined
 """Most competing effects that an experiment is sought for."""
 
+PRINTED = 0.01
+"""Part of the end of a plausible range by which a first estimate has to lie beyond it to be called
+implausible: at the end it is printed like the end."""
 WORTH_TELLING = 0.2
 """Least probability of an effect that a check mentions though the result does not name it."""
 AS_GOOD = 1.64
@@ -797,6 +806,13 @@ def _ranked(found: Findings, score: Score, decision: Decision) -> Ranked:
     )
 
 
+def _beyond(quantity: Quantity) -> bool:
+    """Whether a value lies outside its plausible range by more than it is printed to."""
+    slack = PRINTED * max(abs(quantity.low), abs(quantity.high))
+    values = np.ravel(quantity.value)
+    return bool((values < quantity.low - slack).any() or (values > quantity.high + slack).any())
+
+
 def estimate_in_words(effect: Effect, seconds: float | None, less: bool = False) -> str:
     """What first estimates mean in words, and which of them is beyond its plausible range.
 
@@ -804,7 +820,7 @@ def estimate_in_words(effect: Effect, seconds: float | None, less: bool = False)
     its amplitudes have the other sign.
     """
     text = in_words(effect.readings(seconds))
-    wrong = [each for each in effect.quantities() if not each.plausible]
+    wrong = [each for each in effect.quantities() if _beyond(each)]
     if not text or not wrong or less:
         return text
     one = wrong[0]

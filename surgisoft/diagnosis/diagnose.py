@@ -22,6 +22,8 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from surgisoft.diagnosis.black_box import black_box
 from surgisoft.diagnosis.candidates import candidates
 from surgisoft.diagnosis.criteria import SEARCH

@@ -61,19 +61,22 @@ def test_unknown_effects_of_every_kind_come_in_turn():
     assert all(case.truth == ["unknown"] for case in planned)
 
 
-@pytest.fixture
-def brief(monkeypatch):
-    """Recordings of a few seconds."""
-    for module, name in ((elastica_cases, "BEFORE_S"), (rig_cases, "AFTER_S")):
-        monkeypatch.setattr(module, name, dict.fromkeys(getattr(module, name), 2.5))
-    monkeypatch.setattr(rig_cases, "TRIED_S", 2.5)
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A robot whose recordings take a few seconds; cases are recorded beside it."""
+    place = tmp_path_factory.mktemp("cases")
+    with pytest.MonkeyPatch.context() as patch:
+        for module, name in ((elastica_cases, "BEFORE_S"), (rig_cases, "AFTER_S")):
+            patch.setattr(module, name, dict.fromkeys(getattr(module, name), 2.5))
+        patch.setattr(rig_cases, "TRIED_S", 2.5)
+        make_robot(GENERATOR, place, 2)
+        yield place
 
 
-def test_a_case_repeats_the_actuation_and_differs_by_its_effect(tmp_path, brief):
-    make_robot(GENERATOR, tmp_path, 2)
-    make_case(GENERATOR, tmp_path, Case(0, 2, ("payload",), 1.0, "same"))
-    make_case(GENERATOR, tmp_path, Case(1, 2, (), 1.0, "same"))
-    truth, before, after = load_case(tmp_path, "000")
+def test_a_case_repeats_the_actuation_and_differs_by_its_effect(folder):
+    make_case(GENERATOR, folder, Case(0, 2, ("payload",), 1.0, "same"))
+    make_case(GENERATOR, folder, Case(1, 2, (), 1.0, "same"))
+    truth, before, after = load_case(folder, "000")
     assert truth["truth"] == ["payload"]
     assert truth["same_actuation"]
     assert [recording.name for recording in before] == ["mixed", "other"]
@@ -82,17 +85,16 @@ def test_a_case_repeats_the_actuation_and_differs_by_its_effect(tmp_path, brief)
     found = np.sqrt(np.nanmean(change**2))  # with noise of 0.04 mm in each of six coordinates
     assert found == pytest.approx(truth["change_rms_mm"], abs=0.08)
     assert 0.4 < truth["change_rms_mm"] < 2.5
-    clean, _, _ = load_case(tmp_path, "001")
+    clean, _, _ = load_case(folder, "001")
     assert (clean["truth"], clean["change_rms_mm"]) == ([], 0.0)
 
 
-def test_a_pair_states_what_each_effect_changes(tmp_path, brief):
+def test_a_pair_states_what_each_effect_changes(folder):
     """Each alone, on the actuation of the recording; so the two obey the triangle inequality."""
-    make_robot(GENERATOR, tmp_path, 2)
-    make_case(GENERATOR, tmp_path, Case(3, 2, ("payload", "misalignment"), 1.0, "mixed", "pair"))
-    make_case(GENERATOR, tmp_path, Case(4, 2, ("payload",), 1.0, "mixed"))
-    truth, _, _ = load_case(tmp_path, "pair-003")
-    single, _, _ = load_case(tmp_path, "004")
+    make_case(GENERATOR, folder, Case(3, 2, ("payload", "misalignment"), 1.0, "mixed", "pair"))
+    make_case(GENERATOR, folder, Case(4, 2, ("payload",), 1.0, "mixed"))
+    truth, _, _ = load_case(folder, "pair-003")
+    single, _, _ = load_case(folder, "004")
     each = {one["effect"]: one["change_rms_mm"] for one in truth["hidden"]}
     assert truth["truth"] == ["payload", "misalignment"]
     assert each["payload"] == pytest.approx(single["change_rms_mm"])
@@ -100,12 +102,11 @@ def test_a_pair_states_what_each_effect_changes(tmp_path, brief):
     assert abs(one - other) - 0.05 < truth["change_rms_mm"] < one + other + 0.05
 
 
-def test_what_exists_is_kept(tmp_path, brief):
-    make_robot(GENERATOR, tmp_path, 2)
-    file = tmp_path / "robots" / "2" / "before" / "mixed.parquet"
+def test_what_exists_is_kept(folder):
+    file = folder / "robots" / "2" / "before" / "mixed.parquet"
     stamp = file.stat().st_mtime_ns
-    make_robot(GENERATOR, tmp_path, 2)
+    make_robot(GENERATOR, folder, 2)
     assert file.stat().st_mtime_ns == stamp
     assert load_recording(file).noise_mm == pytest.approx(0.04, abs=0.01)
-    about = json.loads((tmp_path / "robots" / "2" / "robot.json").read_text())
+    about = json.loads((folder / "robots" / "2" / "robot.json").read_text())
     assert about["seed"] == 2

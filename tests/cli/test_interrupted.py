@@ -1,5 +1,6 @@
 """Ctrl-C leaves what is finished, says what that is, and gives exit code 130."""
 
+import io
 import json
 import os
 import re
@@ -60,7 +61,7 @@ CHILD = (
 background has SIGINT ignored, and so would have the command."""
 
 
-def interrupted(command, pattern, folder):
+def interrupted_process(command, pattern, folder):
     """Run a command in a process and send it a SIGINT when its progress matches a pattern.
 
     Returns its standard output and error; the exit code has to be 130.
@@ -81,6 +82,36 @@ def interrupted(command, pattern, folder):
     out, error = child.communicate()
     assert child.returncode == 130, "".join(seen) + error
     return out, error
+
+
+class InterruptedAt(io.StringIO):
+    """Standard error that sends this process a SIGINT once it has a text that matches a pattern."""
+
+    def __init__(self, pattern):
+        super().__init__()
+        self.pattern, self.sent = pattern, False
+
+    def write(self, text):
+        count = super().write(text)
+        if not self.sent and re.search(self.pattern, self.getvalue()):
+            self.sent = True
+            signal.raise_signal(signal.SIGINT)
+        return count
+
+
+def interrupted(command, pattern, folder, monkeypatch, capsys):
+    """The same in this process, which has imported what a command needs."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(surgisoft.cli.progress, "LINE_EVERY_S", 0.0)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    error = InterruptedAt(pattern)
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, "stderr", error)
+            assert run(command.split()) == 130, error.getvalue()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    return capsys.readouterr().out, error.getvalue()
 
 
 def names(folder):
@@ -112,7 +143,7 @@ def test_ctrl_c_before_the_first_validation_of_a_fit_leaves_nothing(bench, monke
 @pytest.mark.parametrize("network", ["haw_nn", "recurrent"])
 def test_ctrl_c_in_the_first_stage_of_a_fit_keeps_its_best_model(network, bench, tmp_path):
     command = f"fit {bench / 'rec.csv'} --network {network} --epochs 100000 --widths 8 -o NEW"
-    out, error = interrupted(command, "fit: .*held-out", tmp_path)
+    out, error = interrupted_process(command, "fit: .*held-out", tmp_path)
     report = json.loads((tmp_path / "NEW" / "report.json").read_text())
     where = report["interrupted"]
     stage = {"haw_nn": "pressure"}.get(network, network)
@@ -129,10 +160,11 @@ def test_ctrl_c_in_the_first_stage_of_a_fit_keeps_its_best_model(network, bench,
     assert "next," not in out
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no SIGINT to one process")
-def test_ctrl_c_in_a_later_stage_of_a_fit_keeps_the_finished_stages(bench, tmp_path):
+def test_ctrl_c_in_a_later_stage_of_a_fit_keeps_the_finished_stages(
+    bench, tmp_path, monkeypatch, capsys
+):
     command = f"fit {bench / 'rec.csv'} --effects hysteresis --epochs 400 --widths 8 -o NEW"
-    _, error = interrupted(command, "hysteresis: held-out", tmp_path)
+    _, error = interrupted(command, "hysteresis: held-out", tmp_path, monkeypatch, capsys)
     report = json.loads((tmp_path / "NEW" / "report.json").read_text())
     assert report["interrupted"]["stage"] == "hysteresis"
     assert report["interrupted"]["finished"] == ["pressure"]
@@ -144,20 +176,20 @@ def test_ctrl_c_in_a_later_stage_of_a_fit_keeps_the_finished_stages(bench, tmp_p
     assert "the model is that of the finished stages: pressure" in error
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no SIGINT to one process")
-def test_ctrl_c_in_improve_keeps_the_finished_rounds(tmp_path):
-    assert run(f"collect mixed --hidden creep payload -o {tmp_path / 'rec.parquet'}".split()) == 0
+def test_ctrl_c_in_improve_keeps_the_finished_rounds(tmp_path, monkeypatch, capsys):
+    collect = f"collect mixed --points 2000 --hidden creep payload -o {tmp_path / 'rec.parquet'}"
+    assert run(collect.split()) == 0
     command = "improve default rec.parquet -o NEW --json j.json --report page"
-    out, error = interrupted(command, "improve: .*creep", tmp_path)
+    out, error = interrupted(command, "improve: .*payload", tmp_path, monkeypatch, capsys)
     found = json.loads((tmp_path / "j.json").read_text())
     assert found["interrupted"]
-    assert found["effects"] == ["creep"]
-    assert [done["step"] for done in found["rounds"]] == ["creep", None]
+    assert found["effects"] == ["payload"]
+    assert [done["step"] for done in found["rounds"]] == ["payload", None]
     assert found["rounds"][-1]["verdict"] == "interrupted"
     assert (
         found["rounds"][0]["error_mm"] == found["error_mm"]["after"] < found["error_mm"]["before"]
     )
-    assert list(load_model(tmp_path / "NEW").effects) == ["hysteresis", "creep"]
+    assert list(load_model(tmp_path / "NEW").effects) == ["hysteresis", "payload"]
     assert json.loads((tmp_path / "NEW" / "report.json").read_text()) == found
     assert "whether an effect is still missing was not decided" in (
         tmp_path / "page" / "report.html"
@@ -166,12 +198,11 @@ def test_ctrl_c_in_improve_keeps_the_finished_rounds(tmp_path):
     assert "NEW, j.json, page" in error.splitlines()[-1]
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no SIGINT to one process")
-def test_ctrl_c_in_evaluate_keeps_the_finished_policies(tmp_path):
+def test_ctrl_c_in_evaluate_keeps_the_finished_policies(tmp_path, monkeypatch, capsys):
     """The same numbers as without an interruption, and none of the policy that was interrupted."""
     task = "evaluate scripted random --task track_circle --episodes 2"
     command = f"{task} --json j.json --report page --replay r.rrd"
-    out, error = interrupted(command, "evaluate: .*random", tmp_path)
+    out, error = interrupted(command, "evaluate: .*random", tmp_path, monkeypatch, capsys)
     found = json.loads((tmp_path / "j.json").read_text())
     assert found["interrupted"]
     assert list(found["policies"]) == ["scripted"]

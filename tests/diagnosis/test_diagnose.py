@@ -32,7 +32,7 @@ from surgisoft.surrogate.effects.contact import LEAST_SHARE
 
 
 @cache
-def recorded(hidden="", take=3, points=3000):
+def recorded(hidden="", take=3, points=2400):
     """What a robot with a hidden effect of amplitude 1 does; nobody may change it."""
     hidden = [(hidden, 1.0)] if hidden else []
     rig = VirtualRig(0, take=take, hidden=hidden)
@@ -54,7 +54,7 @@ def test_nothing_is_named_on_a_clean_robot(found):
 
 def test_a_gap_inside_a_run_is_a_check(found):
     whole = recorded()
-    kept = np.delete(np.arange(whole.samples), np.s_[800:900])
+    kept = np.delete(np.arange(whole.samples), np.s_[1100:1200])
     values = {
         name: getattr(whole, name)[kept] for name in ("t_s", "measured", "key_points_mm", "run")
     }
@@ -293,7 +293,7 @@ def test_steady_state_samples_rank_no_rates(tmp_path, capsys):
         assert absent[name] == "no_motion"
         assert name not in [row.effect for row in result.ranking]
     assert "payload" in [row.effect for row in result.ranking]
-    moving = diagnose(default_arm(), [recorded(points=2400)])
+    moving = diagnose(default_arm(), [recorded()])
     assert not {"line_lag", "rate_dependence"} & {each.effect for each in moving.not_testable}
     save_recording(settled, tmp_path / "x.parquet")
     assert run(["diagnose", "default", str(tmp_path / "x.parquet")]) == 0

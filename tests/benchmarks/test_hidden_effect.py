@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from benchmarks.cache import Cache, digest, model_digest
+from benchmarks.control import policies as control_policies
 from benchmarks.hidden_effect import policies as hidden_effect_policies
 from benchmarks.hidden_effect import study as hidden_effect
 from benchmarks.hidden_effect.rates import trails_s
@@ -19,6 +20,7 @@ from surgisoft.measurement.recordings import load_recording
 from surgisoft.progress import Stages
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, save_model
+from surgisoft.tasks.registry import config_of, with_fields
 
 SMALL = StudyConfig(steps=3072, episodes=1, samples=2400)
 
@@ -85,13 +87,21 @@ def test_a_changed_bench_is_the_rig_with_that_change(tmp_path):
     assert np.nanmax(np.abs(free.key_points_mm - came.key_points_mm)) > 0.1
 
 
+def brief(patch):
+    """Let a study look without cameras, in one recording, and in episodes of half the time."""
+    patch.setattr(hidden_effect_policies, "SIGHTS", ("blind",))
+    patch.setattr(hidden_effect, "ORACLE_TAKES", 1)
+    patch.setattr(
+        control_policies, "config_of", lambda task: with_fields(config_of(task), loop_s=8.0)
+    )
+
+
 @pytest.fixture(scope="module")
 def payload(tmp_path_factory):
     """The outcome of a payload with policies that hardly learned anything, and its folder."""
     folder = tmp_path_factory.mktemp("study")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(hidden_effect_policies, "SIGHTS", ("blind",))
-        patch.setattr(hidden_effect, "ORACLE_TAKES", 1)
+        brief(patch)
         yield run(["payload"], SMALL, folder, nothing)[0], folder
 
 
@@ -118,8 +128,7 @@ def test_the_script_tracks_the_hidden_payload_better_with_the_amended_model(payl
 
 def test_a_study_that_was_done_is_not_done_again(payload, monkeypatch):
     outcome, folder = payload
-    monkeypatch.setattr(hidden_effect_policies, "SIGHTS", ("blind",))
-    monkeypatch.setattr(hidden_effect, "ORACLE_TAKES", 1)
+    brief(monkeypatch)
     for name in ("diagnose", "amend", "fit", "fall_of"):
         monkeypatch.setattr(hidden_effect, name, lambda *_, name=name: pytest.fail(name))
     monkeypatch.setattr(hidden_effect_policies, "evaluated", lambda *_: pytest.fail("evaluated"))

@@ -78,7 +78,7 @@ def gated(rows: int):
     ("model", "recorded", "source"),
     [
         ("default", lambda: [bench("leak", 3)], "sidecar"),
-        ("default", lambda: [bench("payload", 5, 1200), bench("payload", 6, 1000)], "sidecar"),
+        ("default", lambda: [bench("payload", 5, 800), bench("payload", 6, 700)], "sidecar"),
         ("default", lambda: [replace(bench("hysteresis", 7, 6000), noise_mm=None)], "holds"),
         (None, lambda: [gated(ROWS)], "second differences"),
     ],

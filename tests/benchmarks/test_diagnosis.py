@@ -36,6 +36,8 @@ from surgisoft.rig.hidden import HIDDEN
 from surgisoft.surrogate.checkpoint import DEFAULT_FOLDER, default_arm
 
 CLEAN = Case(0, (), 0.0, "white", "medium", take=5)
+BRIEF = replace(CLEAN, excitation="poor")
+"""Half as long, on one kind of motion."""
 
 
 @pytest.fixture(scope="module")
@@ -50,9 +52,9 @@ def folder(tmp_path_factory):
     ("case", "kind", "effects"),
     [
         (CLEAN, "nothing_missing", ()),
-        (replace(CLEAN, hidden=(("softening", 2.0),)), "identified", ("softening",)),
+        (replace(BRIEF, hidden=(("softening", 2.0),)), "identified", ("softening",)),
         (
-            replace(CLEAN, hidden=(("gain_mismatch", 1.0),), discrepancy_mm=0.25),
+            replace(BRIEF, hidden=(("gain_mismatch", 1.0),), discrepancy_mm=0.25),
             "identified",
             ("gain_mismatch",),
         ),

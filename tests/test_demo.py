@@ -2,6 +2,7 @@
 
 import base64
 import time
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -12,6 +13,7 @@ from surgisoft.demonstration import story
 from surgisoft.errors import InputError
 from surgisoft.files import write_atomically
 from surgisoft.measurement.recordings import load_recordings
+from surgisoft.replay.episode_view import write_replay
 from surgisoft.report import Text
 from surgisoft.surrogate.checkpoint import load_model
 
@@ -19,9 +21,11 @@ from surgisoft.surrogate.checkpoint import load_model
 def test_five_steps_with_their_pictures(tmp_path, monkeypatch, capsys):
     """On a shorter recording; the packaged policies cut, the hidden effect is found and added.
 
-    The picture of the replay is a small one: `tests/replay` has those of the viewer.
+    The picture of the replay is a small one, and the replay has a tenth of the endoscope's
+    pictures: `tests/replay` has those of the viewer, and whole replays.
     """
     monkeypatch.setattr(story, "POINTS", 1600)
+    monkeypatch.setattr(story, "write_replay", partial(write_replay, pictures_hz=0.25))
     shown = []
 
     def picture(replay, screenshot):

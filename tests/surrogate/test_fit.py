@@ -75,13 +75,13 @@ def test_a_plain_traverse_supports_neither_direction_nor_memory():
     """The trap: direction and memory are confounded with position; the simpler model is kept."""
     rng = np.random.default_rng(3)
     train, test = history([traverse(11)]), history([walk(400, rng)], seed=4)
-    config = FitConfig(hidden=(64, 64), epochs=60, effects=("hysteresis",))
+    config = FitConfig(hidden=(64, 64), epochs=30, effects=("hysteresis",))
     guarded = fit(train, None, SPEC, config)
     assert not guarded.model.effects
     assert not guarded.model.network.directions
     assert any("chamber 1: it reversed only" in warning for warning in guarded.warnings)
     assert any("swept its whole range" in warning for warning in guarded.warnings)
-    plain = fit(train, None, SPEC, FitConfig(hidden=(64, 64), epochs=60, inputs="pressure"))
+    plain = fit(train, None, SPEC, FitConfig(hidden=(64, 64), epochs=30, inputs="pressure"))
     assert rmse(guarded.model, test) <= 1.1 * rmse(plain.model, test)
 
 

@@ -285,7 +285,12 @@ def _marked_faces(triangles: np.ndarray, samples: np.ndarray) -> np.ndarray:
         return np.zeros(len(triangles), bool)
     middles = triangles.mean(axis=1)
     size = np.linalg.norm(triangles - middles[:, None], axis=2).max(axis=1)
-    return cKDTree(samples).query(middles)[0] <= size + SAMPLE_MM
+    reach = size + SAMPLE_MM
+    # Most faces lie outside of the box around all samples by more than their own reach.
+    outside = np.maximum(samples.min(0) - middles, middles - samples.max(0)).clip(min=0.0)
+    near = np.linalg.norm(outside, axis=1) <= reach
+    near[near] = cKDTree(samples).query(middles[near])[0] <= reach[near]
+    return near
 
 
 def film_table() -> tuple[np.ndarray, np.ndarray]:

@@ -11,6 +11,8 @@ import pytest
 from surgisoft.cli import run
 from surgisoft.diagnosis.design.isolability import isolability
 from surgisoft.diagnosis.design.next_experiment import (
+    Pair,
+    Recommendation,
     likely_competing,
     make_plans,
     next_experiment,
@@ -301,3 +303,13 @@ def test_after_a_change_by_hand_the_new_recording_is_diagnosed_alone(tmp_path, l
     alone = f"then: surgisoft diagnose {model} NEW.parquet" in printed
     together = f"then: surgisoft diagnose {model} {data} NEW.parquet" in printed
     assert (alone, together) == (answer.by_hand, not answer.by_hand)
+
+
+@pytest.mark.parametrize(("before", "told"), [(0.6, False), (0.99, True)])
+def test_an_experiment_that_is_not_needed_says_what_else_may_be_the_matter(before, told):
+    pair = Pair(("payload", "line_lag"), before, 0.99)
+    found = Recommendation(
+        "steps", Protocol("p", "settled", [[0.0]], [0]), "bench", 5.0, (pair,), ()
+    )
+    assert f"goes from {before:.2f} to 0.99" in found.why
+    assert ("both may be missing" in found.why) == told

@@ -559,6 +559,13 @@ class Pair:
     """With the experiment too."""
 
 
+TOLD_APART = (
+    "what is recorded should tell them apart already: where 'surgisoft diagnose' cannot, both may "
+    "be missing, or another effect, and 'surgisoft improve' adds what lowers the error"
+)
+"""What is said where no experiment is needed to tell two effects apart."""
+
+
 @dataclass(frozen=True, eq=False)
 class Recommendation:
     """The recommended experiment, and how well it distinguishes the competing effects."""
@@ -600,7 +607,7 @@ class Recommendation:
 
     @property
     def by_hand(self) -> bool:
-        """Whether it takes a experimental setup that the virtual rig has no option for."""
+        """Whether it takes an experimental setup that the virtual rig has no option for."""
         return bool(self.removes)
 
     @property
@@ -622,7 +629,7 @@ class Recommendation:
         return (
             f"the chance to tell {a} from {b} goes from {worst.before:.2f} to {worst.after:.2f}"
             + (many if len(self.pairs) > 1 else "")
-            + ("; what is recorded should tell them apart already" if worst.before >= SURE else "")
+            + (f"; {TOLD_APART}" if worst.before >= SURE else "")
         )
 
     def to_json(self) -> dict:

@@ -1,6 +1,7 @@
 """What is to be treated is computed once for scenes of equal content, and again for any other."""
 
-from dataclasses import replace
+import itertools
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -14,16 +15,28 @@ from surgisoft.tasks.world.treatment import rings, treatment_of
 BAND_MM, POINTS = 2.0, 24
 
 
-@pytest.fixture
-def counted():
-    """A plan of rings that counts how often it is asked."""
-    asked = []
+ASKED = []
+"""Diameters of the lesions that a plan was asked about, mm."""
+NUMBERS = itertools.count()
+"""Numbers of plans, so that none is known from another test."""
 
-    def plan(scene, vary, band_mm, view_points):
-        asked.append(scene.spec.lesion.diameter_mm)
+
+@dataclass(frozen=True)
+class Counted:
+    """Rings, by a plan that notes each time that it is asked."""
+
+    number: int
+
+    def __call__(self, scene, vary, band_mm, view_points):
+        ASKED.append(scene.spec.lesion.diameter_mm)
         return rings(scene, vary, band_mm, view_points)
 
-    return plan, asked
+
+@pytest.fixture
+def counted():
+    """A plan that nobody has asked before."""
+    ASKED.clear()
+    return Counted(next(NUMBERS)), ASKED
 
 
 def test_a_scene_that_is_opened_again_is_not_planned_again(counted):
@@ -57,17 +70,30 @@ def test_another_lesion_band_or_randomisation_is_planned_anew(counted):
     assert np.ptp(others[0].paths_mm, axis=1).max() < 0.75 * np.ptp(plain.paths_mm, axis=1).max()
 
 
-def test_a_plan_without_a_hash_is_asked_each_time():
-    class Own:
-        """A plan that compares by its values, and so has no hash."""
+@dataclass
+class Changing:
+    """A plan whose values may change."""
 
-        asked = 0
-        __hash__ = None
+    asked: int = 0
 
-        def __call__(self, scene, vary, band_mm, view_points):
-            Own.asked += 1
-            return rings(scene, vary, band_mm, view_points)
+    def __call__(self, scene, vary, band_mm, view_points):
+        self.asked += 1
+        return rings(scene, vary, band_mm, view_points)
 
-    for _ in range(2):
-        treatment_of(Own(), open_scene(PHANTOM), NOT_RANDOMISED, BAND_MM, POINTS)
-    assert Own.asked == 2
+    __hash__ = object.__hash__
+
+
+@dataclass(frozen=True)
+class Unhashed(Counted):
+    """A frozen plan with a value that has no hash."""
+
+    number: list
+
+
+def test_a_plan_that_may_answer_otherwise_is_asked_each_time(counted):
+    changing = Changing()
+    for plan in (changing, Unhashed([])):
+        for _ in range(2):
+            treatment_of(plan, open_scene(PHANTOM), NOT_RANDOMISED, BAND_MM, POINTS)
+    assert changing.asked == 2
+    assert len(ASKED) == 2

@@ -101,14 +101,24 @@ def treatment_of(
 ) -> Treatment:
     """What a plan treats; a few are kept, so that the next environment of a scene is made sooner.
 
-    Its arrays are shared, and not to be changed.
+    Kept are those of `rings` and of plans that are frozen dataclasses: any other plan may answer
+    otherwise the next time. The arrays are shared, and not to be changed.
     """
-    what = _Planned(plan, scene.content_hash, vary, band_mm, view_points, scene)
-    try:
-        hash(what)
-    except TypeError:  # a plan of the user's own may have no hash
+    if not _is_fixed(plan):
         return plan(scene, vary, band_mm, view_points)
-    return _of_planned(what)
+    return _of_planned(_Planned(plan, scene.content_hash, vary, band_mm, view_points, scene))
+
+
+def _is_fixed(plan: Plan) -> bool:
+    """Whether a plan is `rings`, or a frozen dataclass of values that have a hash."""
+    values = getattr(type(plan), "__dataclass_params__", None)
+    if values is None or not values.frozen:
+        return plan is rings
+    try:
+        hash(plan)
+    except TypeError:
+        return False
+    return True
 
 
 def rings(scene: Scene, vary: Randomisation, band_mm: float, view_points: int) -> Treatment:

@@ -115,8 +115,6 @@ def improve(
         given = (" ".join(map(str, some)) for some in (recordings, before or ()))
         found = result.diagnoses[-1]
         command = with_effect_files(found.command(str(last), *given)) if found.next_command else ""
-        # The new model describes the arm after the change, and not the one before.
-        command = "" if before and result.claimed else command
         written += write_improve_report(result, tables, report, title, command)
     if replay:
         written.append(write_before_and_after(result, tables, model.name, replay))
@@ -145,7 +143,7 @@ def _show(result) -> None:
     for number, done in enumerate(result.rounds, 1):
         what = f"+ {done.step}" if done.step else "no further effect"
         what = "interrupted" if done.verdict == "interrupted" else what
-        what += ", in its best form beside the others" if done.anew else ""
+        what += ", fitted anew in its best form" if done.anew else ""
         what += ", fitted together with the network" if done.together else ""
         competing = f" (or {', '.join(done.competing)})" if done.competing else ""
         print(f"round {number}: {done.verdict}: {done.sentence}")

@@ -87,7 +87,8 @@ def refuse_amended(
             raise InputError(
                 f"{recording.label}: {seen.words}, expected a model from before the change: "
                 f"compared with {names}, what these effects explain would be found again; leave "
-                "out --before, or give the model that was amended to 'surgisoft improve'"
+                "out --before, or run 'surgisoft improve' on the model as it was before these "
+                "effects were added"
             )
 
 

@@ -206,10 +206,10 @@ def load_model(
     if is_callable_name(str(folder)):
         return arm_by_itself(named_callable(str(folder))).to(device)
     folder = _place(folder)
-    if not (folder / "config.json").is_file() or not (folder / "weights.safetensors").is_file():
-        lacks = "config.json" if not (folder / "config.json").is_file() else "weights.safetensors"
+    absent = [n for n in ("config.json", "weights.safetensors") if not (folder / n).is_file()]
+    if absent:
         raise InputError(
-            f"{folder}: no arm model there ({lacks} is missing); expected 'default' or a "
+            f"{folder}: no arm model there ({absent[0]} is missing); expected 'default' or a "
             "folder that 'surgisoft fit' made"
         )
     file = folder / "config.json"

@@ -497,7 +497,10 @@ def _finish(data: Data, result: FitResult) -> None:
 
 
 def _still_chambers(train: History, spec: ArmSpec) -> list[str]:
-    """A note for each chamber that hardly moved in the training recordings."""
+    """A note for each chamber that hardly moved in the training recordings.
+
+    Raises InputError where none moved at all.
+    """
     pressure = train.rows(train.pressure)
     moved = (pressure.amax(0) - pressure.amin(0)).tolist()
     if not max(moved):

@@ -88,10 +88,10 @@ def complete_effects(incomplete: str) -> list[str]:
 
 def complete_memories(incomplete: str) -> list[str]:
     """Effects that a fit adds (those of the line and the material), and `auto`, as above."""
-    from surgisoft.surrogate.effects import EFFECTS
+    from surgisoft.surrogate.effects import EFFECTS, FRONT
     from surgisoft.surrogate.effects.user_defined import offered
 
-    mine = [name for name, kind in EFFECTS.items() if kind.stage in ("line", "material")]
+    mine = [name for name, kind in EFFECTS.items() if kind.stage in FRONT]
     return _begin_so([*mine, *offered(), "auto"], incomplete)
 
 

@@ -80,6 +80,7 @@ from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
 from surgisoft.surrogate.effects import (
+    FRONT,
     Effect,
     Quantity,
     hypothesis_of,
@@ -108,8 +109,6 @@ ABOUT = 1.1
 MOSTLY = 0.5
 """Share of what is left in one line of its spectrum from which the motion is said to be periodic:
 most of it."""
-FITTED_STAGES = ("line", "material")
-"""Stages of effects that a network can be fitted together with."""
 MOST_FITTED = 3
 """Most effects that a fit is recommended with; `fit` takes those that lower its held-out error."""
 REASONS = {
@@ -668,7 +667,7 @@ def would_explain(found: Findings, decision: Decision) -> list[str]:
         f"error is no larger than the model's validated error (both without their noise), so an "
         f"error of the fit explains it as well"
     )
-    if known_effects()[best.effect].stage in ("line", "material"):
+    if known_effects()[best.effect].stage in FRONT:
         text += f"; fit the network together with it (fit --effects {best.effect}) and compare"
     return [text]
 
@@ -940,7 +939,7 @@ def next_command(decision: Decision) -> str:
         return "surgisoft fit {data} -o NEW"
     if decision.reason == "learned":
         known = known_effects()
-        inside = [n for n in decision.probabilities.effects if known[n].stage in FITTED_STAGES]
+        inside = [n for n in decision.probabilities.effects if known[n].stage in FRONT]
         effects = " ".join(inside[:MOST_FITTED])
         return f"surgisoft fit {{data}} --inputs pressure --effects {effects} -o NEW"
     if kind == "cannot_tell":

@@ -45,7 +45,7 @@ from surgisoft.diagnosis.statistics import (
 )
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.progress import Progress, silent
-from surgisoft.surrogate.effects import Memoryless, Stage, in_words, known_effects
+from surgisoft.surrogate.effects import FRONT, Memoryless, Stage, in_words, known_effects
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel, Validation
 from surgisoft.surrogate.training import Data, JointTraining, train_jointly
@@ -293,8 +293,6 @@ def beside(value: float, reference: float) -> str:
     return f"{ratio:.3g} times" if ratio >= 1.005 else "as large as"
 
 
-FRONT: tuple[Stage, ...] = ("line", "material")
-"""Stages in front of the network."""
 LINE: Stage = "line"
 """Stage between a command and the pressure of a chamber. A first-order lag of the pressure and one
 of the wall are the same operator on the actuation: where both fit as well and the model's input is

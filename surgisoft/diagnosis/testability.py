@@ -16,7 +16,7 @@ from surgisoft.diagnosis.candidates import Candidate
 from surgisoft.diagnosis.criteria import SEARCH
 from surgisoft.diagnosis.other_models import has_slope
 from surgisoft.diagnosis.residuals import Problem
-from surgisoft.surrogate.effects import Effect, hypothesis_of, known_effects
+from surgisoft.surrogate.effects import FRONT, Effect, hypothesis_of, known_effects
 
 Cause = Literal["no_motion", "no_reversals", "no_change", "below_noise", "no_slope"]
 """Steady-state samples only; no inner reversals of the actuation; no change of the prediction at
@@ -90,7 +90,7 @@ def _cause(
 ) -> Cause | None:
     """Why an effect cannot show; None where it can."""
     hypothesis = hypothesis_of(kind)
-    if kind.stage in ("line", "material") and not has_slope(problem.model):
+    if kind.stage in FRONT and not has_slope(problem.model):
         return "no_slope"
     if hypothesis.needs_motion and not problem.table.timed[problem.index.numpy()].any():
         return "no_motion"

@@ -16,7 +16,7 @@ from torch import Tensor
 from surgisoft.errors import InputError
 from surgisoft.surrogate.arm import ArmState
 from surgisoft.surrogate.callables.network import CallableNetwork
-from surgisoft.surrogate.effects import Context, Effect, Memoryless, Stage
+from surgisoft.surrogate.effects import FRONT, Context, Effect, Memoryless, Stage
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.networks import rowwise_jacobian
 from surgisoft.surrogate.scan import direction_scan, direction_step
@@ -578,7 +578,7 @@ class Chain:
         effects act through. Effects behind the effect are assumed to pass the change on unchanged.
         """
         changes = effect.sensitivities(at, memory)
-        if effect.stage in ("line", "material"):
+        if effect.stage in FRONT:
             changes = torch.einsum("snjm,ksm->ksnj", slope, changes)
         return changes
 

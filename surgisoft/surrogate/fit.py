@@ -23,7 +23,7 @@ from torch import Tensor
 from surgisoft.errors import InputError, Interrupted, unknown_name
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.chain import Taps
-from surgisoft.surrogate.effects import hypothesis_of, known_effects, make_effect
+from surgisoft.surrogate.effects import FRONT, hypothesis_of, known_effects, make_effect
 from surgisoft.surrogate.ensemble import train_ensemble
 from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.history import History
@@ -560,7 +560,7 @@ def _check(train: History, valid: History | None, spec: ArmSpec, config: FitConf
             continue
         if name not in known:
             raise unknown_name("effect", name, known)
-        if known[name].stage not in ("line", "material"):
+        if known[name].stage not in FRONT:
             raise InputError(
                 f"{name} acts on the {known[name].stage}, behind the network: "
                 f"fit without it, then 'surgisoft amend --effect {name}' adds it"

@@ -31,6 +31,7 @@ from torch import Tensor, nn
 from surgisoft.diagnosis.estimation.nuisance import Nuisance, held_out_parts
 from surgisoft.diagnosis.residuals import Problem
 from surgisoft.surrogate.chain import RepeatedScan
+from surgisoft.surrogate.effects import FRONT
 from surgisoft.surrogate.model import ArmModel
 
 
@@ -286,7 +287,7 @@ def amplitude_sensitivities(model: ArmModel, forward: RepeatedScan, key: str) ->
     mode = forward.mode()
     memory = rows(effect.scan(mode.start[key], signal.value, mode.context_at(signal)))
     slope = None
-    if effect.stage in ("line", "material"):
+    if effect.stage in FRONT:
         taps = model.chain.scan(forward.history, forward.first_pressure, model.chain.inner)
         slope = model.chain.slope(forward.history, forward.first_pressure, taps, rows)
     changes = model.chain.sensitivities(effect, rows(signal.value), memory, slope)

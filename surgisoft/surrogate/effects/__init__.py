@@ -6,6 +6,7 @@ from pathlib import Path
 from surgisoft.errors import unknown_name
 from surgisoft.surrogate.effects import user_defined
 from surgisoft.surrogate.effects.base import (
+    FRONT,
     STAGES,
     ArmFacts,
     Context,
@@ -53,6 +54,7 @@ EFFECTS: dict[str, type[Effect]] = {
 
 __all__ = [
     "EFFECTS",
+    "FRONT",
     "STAGES",
     "ArmFacts",
     "Context",

@@ -22,6 +22,8 @@ from surgisoft.surrogate.effects.readings import Reading
 
 Stage = Literal["line", "material", "body", "sensor"]
 STAGES: tuple[Stage, ...] = ("line", "material", "body", "sensor")
+FRONT: tuple[Stage, ...] = ("line", "material")
+"""Those in front of the network; it is fitted together with effects there."""
 
 
 @dataclass(frozen=True)

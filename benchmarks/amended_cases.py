@@ -38,13 +38,13 @@ from benchmarks.decision.evidence_log import (
     in_order,
     stored,
 )
-from benchmarks.decision.fit import NAMING, fit, model_of
+from benchmarks.decision.fit import fit, model_of
 from benchmarks.decision.folders import model_folder, robot_folder
 from benchmarks.decision.table import Judged, default_models, judged
 from benchmarks.diagnosis.after_table import SHOWS
 from benchmarks.diagnosis.amend import Amended, amended
 from benchmarks.rig_cases import TAKES, Generator, after_protocol
-from surgisoft.diagnosis.decision import fitted_decision
+from surgisoft.diagnosis.decision import NAMING, fitted_decision
 from surgisoft.diagnosis.improve import NETWORK, improve
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import Recording, load_recordings

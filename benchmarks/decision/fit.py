@@ -23,6 +23,7 @@ from surgisoft.diagnosis.decision import (
     CALIBRATED,
     FEATURES,
     LEAST_CHANCE,
+    NAMING,
     SCHEMA,
     Curve,
     Decision,
@@ -40,8 +41,6 @@ PENALTIES = (0.3, 1.0, 3.0, 10.0, 30.0)
 features of order 1."""
 CONSTANT_PENALTY = 0.01
 """Ridge penalty on the constant."""
-NAMING = ("identified", "several", "ambiguous")
-"""Kinds of result that name an effect."""
 OFF = ("network", "other_robot")
 """Labels of cases whose model is off."""
 WEAK = 0.5

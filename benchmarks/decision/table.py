@@ -10,7 +10,6 @@ from scipy import stats
 
 from benchmarks.decision.evidence_log import Labelled, in_order
 from benchmarks.decision.fit import (
-    NAMING,
     OFF,
     WEAK,
     fit,
@@ -19,7 +18,7 @@ from benchmarks.decision.fit import (
     names_wrongly,
 )
 from surgisoft.diagnosis.criteria import WORTH, Worth
-from surgisoft.diagnosis.decision import Decision, DecisionModel, decide
+from surgisoft.diagnosis.decision import NAMING, Decision, DecisionModel, decide
 
 BINS = (0.0, 0.5, 0.8, 0.9, 0.95, 1.0)
 """Bins of the reliability table."""

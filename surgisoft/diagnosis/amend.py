@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from surgisoft.diagnosis.data_quality import FAR_ROWS, far_share
+from surgisoft.diagnosis.diagnose import lacking_before
 from surgisoft.diagnosis.estimation.effects import fit_effects
 from surgisoft.diagnosis.estimation.intervals import Estimates, Parameter, beside_former
 from surgisoft.diagnosis.estimation.network import retune
@@ -340,7 +341,7 @@ def amend(
         both = before_and_after(plain, earlier, paired).with_final_check()
         if both.strange is not None:
             raise InputError(both.strange_in_words)
-        notes, table = (*notes, *both.notes_of_fit), both.table
+        notes, table = (*notes, *both.notes_of_fit, *lacking_before(both, tell)), both.table
     problem = table.training()
     names = list(dict.fromkeys(names))
     judged = None

@@ -54,6 +54,8 @@ Kind = Literal[
     "cannot_tell",
     "setup",
 ]
+NAMING: tuple[Kind, ...] = ("identified", "several", "ambiguous")
+"""Kinds of result that name effects."""
 Reason = Literal["network", "learned", "repeatability", "few_data", "schedule", "before"]
 """Why a diagnosis cannot tell: the model is not that of this arm; the model has learned part of
 what is missing; how well recordings of an unchanged arm agree is not known well enough; there are

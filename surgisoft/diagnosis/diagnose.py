@@ -38,6 +38,7 @@ from surgisoft.diagnosis.decision import (
     CLEAR_SHIFT,
     LEAST_EXPLAINED,
     MOSTLY_STATIC,
+    NAMING,
     Decision,
     Kind,
     Probabilities,
@@ -492,6 +493,31 @@ def without_before(both: BeforeAfter) -> Diagnosis:
         next_command="surgisoft diagnose {model} {data}",
         change=both.change,
         in_fit=problem.in_fit,
+    )
+
+
+def lacking_before(both: BeforeAfter, report: Progress) -> tuple[str, ...]:
+    """A note where the model lacks effects on the recordings from before the change already; else
+    none.
+
+    The paired difference takes the network's response for that of the arm: a lag that the arm had
+    before changes what a further lag does.
+    """
+    if both.strange is not None:
+        return ()
+    report(f"what the model lacks on {both.names}")
+    problem = with_known_residuals(both.earlier.training())
+    verdict = result_of(findings_of(problem, lambda text: None, ())[0]).verdict
+    if verdict.kind not in NAMING:
+        return ()
+    named = (" or " if verdict.kind == "ambiguous" else " and ").join(verdict.effects)
+    again = problem.in_fit and all(map(can_hide, verdict.effects))
+    return (
+        f"the model lacks {named} on the recordings from before the change already (error "
+        f"{problem.rmse_mm:.3g} mm, floor {problem.floor_mm:.3g} mm), so the parameters of what "
+        "has changed may be off by more than their intervals say: run 'surgisoft improve"
+        f"{' --refit always' * bool(again)}' on the model and {both.names} first, and amend the "
+        "model that it writes",
     )
 
 

@@ -16,7 +16,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 
 from surgisoft.diagnosis.amend import Fall, Track, fall_of, of_change, track_of
-from surgisoft.diagnosis.diagnose import Diagnosis, diagnose, diagnose_change, with_setup
+from surgisoft.diagnosis.diagnose import (
+    Diagnosis,
+    diagnose,
+    diagnose_change,
+    lacking_before,
+    with_setup,
+)
 from surgisoft.diagnosis.estimation.effects import Fitted, fit_effects, fit_plausible
 from surgisoft.diagnosis.estimation.intervals import (
     Estimates,
@@ -260,7 +266,8 @@ def improve(
         refuse_amended(model, recordings, earlier)
         both = before_and_after(table, earlier, paired).with_final_check()
         # Named by the change, which residuals tell without pairs, and fitted to the residuals.
-        notes = (*notes, *dict.fromkeys((*both.notes, *both.notes_of_fit)))
+        limits = (*both.notes, *both.notes_of_fit, *lacking_before(both, lambda text: None))
+        notes = (*notes, *dict.fromkeys(limits))
         problem = both.table.training()
         asked = both.training()
     is_paired = both is not None and both.used

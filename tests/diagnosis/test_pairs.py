@@ -570,6 +570,23 @@ def test_the_amendment_of_such_a_change_is_warned_of(model):
     assert right.strange_in_words == ""
 
 
+@pytest.mark.parametrize("own", [(), (("creep", 1.5),)])
+def test_what_the_model_lacked_before_the_change_is_said(own):
+    """An own creep is no change, but what changes acts through it."""
+    takes = []
+    for take, hidden in ((1, ()), (2, (("payload", 1.5),))):
+        rig = VirtualRig(0, take=take, hidden=(*own, *hidden))
+        takes.append(rig.record(make_protocol("mixed", rig.limits, 2400, seed=5))[0])
+    before, after = takes
+    notes = amend(default_arm(), [after], "payload", before=[before], retune_network=False).notes
+    if not own:
+        assert notes == ()
+        return
+    (note,) = notes
+    assert note.startswith("the model lacks creep on the recordings from before the change already")
+    assert f"'surgisoft improve' on the model and {before.name} first" in note
+
+
 def test_one_recording_before_and_after_is_refused(model, tmp_path, capsys):
     save_model(model, tmp_path / "arm")
     (tmp_path / "x").mkdir()

@@ -142,11 +142,11 @@ def _test_setup(arm: "ArmModel", name: str, recordings: list) -> None:
     if found is None:
         fit = fit_of_model(arm, recordings)
         if fit is None:
-            print(f"set-up: no fault that {name} shows")
+            print(f"set-up faults: none found by comparison with {name}")
             return
         error = f"error {fit.rmse_mm:.3g} mm, expected about {fit.expected_mm:.3g} mm"
         if fit.fits:
-            print(f"set-up: no fault that {name} shows ({error})")
+            print(f"set-up faults: none found by comparison with {name} ({error})")
             return
         warn(
             f"set-up: {name} does not describe this arm's motion of {fit.motion_mm:.3g} mm "

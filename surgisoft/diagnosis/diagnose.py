@@ -926,7 +926,7 @@ def sentence_of(
         most = _most_probable(decision)
         most = f" (most probable: {most})" if most else ""
         return f"cannot tell what is missing, if anything: {why}{most}; {error}"
-    return f"these recordings show no missing effect; {error}"
+    return f"these recordings show no missing effect (confidence {sure:.2f}); {error}"
 
 
 def _why(reason: str, levels: ErrorLevels, static: bool) -> str:

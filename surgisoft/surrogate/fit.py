@@ -344,6 +344,8 @@ class FitResult:
             if stage.tried_mm:
                 tried = ", ".join(f"{name} {rmse:.3f}" for name, rmse in stage.tried_mm.items())
                 lines.append(f"tried for {stage.name}, held-out RMSE in mm: {tried}")
+        if isinstance(self.model.network, HawNN) and self.model.network.prior is not None:
+            lines.append("prior mean: a chain of arcs, to which the network adds what they leave")
         lines += [f"note: {warning}" for warning in self.warnings]
         error = self.model.validation
         points = " ".join(

@@ -628,13 +628,13 @@ def test_an_import_names_what_looks_wrong(bench, tmp_path, capsys, monkeypatch):
     assert "note: the clock was set\n" in shown.out
     assert f"would write {new}: " in shown.out
     assert shown.out.endswith(
-        "set-up: no fault that default shows (error 0.4 mm, expected about 0.42 mm)\n"
+        "set-up faults: none found by comparison with default (error 0.4 mm, expected about 0.42 mm)\n"
     )
     assert f"{new}, row 5: a jump of 30 mm" in shown.err
     monkeypatch.setattr(fit, lambda *_: ModelFit(54.0, 0.42, 10.0))
     assert run([*command, "--model", "default"]) == 0
     shown = capsys.readouterr()
-    assert "no fault that default shows" not in shown.out
+    assert "none found by comparison" not in shown.out
     assert "default does not describe this arm's motion of 10 mm (error 54 mm, " in shown.err
     assert "no fault that is tested explains it: check that MODEL is of this arm" in shown.err
     monkeypatch.setattr(

@@ -189,8 +189,10 @@ def test_a_network_has_a_prior_mean_unless_none_is_asked_for():
         ("arcs", "haw_nn", 2),
         ("none", "haw_nn", 0),
     ):
-        model = fit(train, None, TWO, FitConfig(prior=prior, network=network, **how)).model
-        assert model.network.arcs == arcs
+        result = fit(train, None, TWO, FitConfig(prior=prior, network=network, **how))
+        assert result.model.network.arcs == arcs
+        said = [line for line in result.lines() if line.startswith("prior mean: a chain of arcs")]
+        assert len(said) == (arcs > 0)
     baseline = fit(train, None, TWO, FitConfig(network="constant_curvature", **how)).model
     assert baseline.network.sections == 1
 

@@ -134,7 +134,12 @@ def data_quality_warnings(problem: Problem) -> list[str]:
             "simulation? What the line delays then looks like a lag of the arm; if there are no "
             "sensors, use a model of the commands (fit --actuation commanded)"
         )
-    missing = float(np.isnan(problem.measured).mean())
+    absent = np.isnan(problem.measured)
+    for point in np.flatnonzero(absent.any(2).all(0)):
+        warnings.append(
+            f"key point k{point} is missing in every row: what moves it alone cannot be seen"
+        )
+    missing = float(absent.mean())
     if missing > MOST_MISSING:
         warnings.append(f"{100 * missing:.0f} % of the key points are missing")
     return warnings

@@ -589,8 +589,12 @@ def _check(train: History, valid: History | None, spec: ArmSpec, config: FitConf
             raise InputError(
                 f"{seen} rows with key points, expected at least {LEAST_ROWS}; record more"
             )
-    if (~train.key_points.isnan()).flatten(0, 1).any(0).logical_not().any():
-        raise InputError("a key point is missing in every row of the training recordings")
+    lost = train.key_points.isnan().any(-1).flatten(0, 1).all(0).nonzero().flatten().tolist()
+    if lost:
+        raise InputError(
+            f"key point k{lost[0]} is missing in every row of the training recordings, expected "
+            "measurements of it; give recordings that show it, or leave its columns out of them"
+        )
     if train.chambers != spec.chambers:
         raise InputError(f"{train.chambers} chambers recorded, expected {spec.chambers}")
 

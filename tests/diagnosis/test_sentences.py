@@ -359,10 +359,13 @@ def test_warnings_about_recordings_are_a_sentence_each():
 
     holes = np.zeros((10, 2, 3))
     holes[:5] = np.nan
+    lost = np.zeros((10, 6, 3))
+    lost[:, 1, 2] = np.nan
     unknown, held = table("unknown"), table("holds")
     for fields, message in (
         ({}, None),
         ({"measured": holes}, "50 % of the key points are missing"),
+        ({"measured": lost}, "key point k1 is missing in every row: what moves it alone cannot"),
         ({"motion": np.zeros(8, int)}, "their 8 blocks of time show 1 different motions"),
         ({"table": unknown}, "state noise_mm in the sidecar for a better noise floor"),
         (

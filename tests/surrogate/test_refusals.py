@@ -281,7 +281,7 @@ def test_recordings_that_cannot_be_fitted_are_one_line(short):
     points = short.key_points[0].clone()
     points[:, 0] = torch.nan
     lost = pack([short.t_s[0]], [short.pressure[0]], [points])
-    with pytest.raises(InputError, match="a key point is missing in every row of the training"):
+    with pytest.raises(InputError, match="key point k0 is missing in every row of the training"):
         fit(lost, None, SPEC, FitConfig(hidden=(2,), epochs=1))
     other = ArmSpec(SPEC.chambers + 1, SPEC.key_points, (0.0,) * 4, (1.0,) * 4)
     with pytest.raises(InputError, match="3 chambers recorded, expected 4"):

@@ -628,7 +628,8 @@ def test_an_import_names_what_looks_wrong(bench, tmp_path, capsys, monkeypatch):
     assert "note: the clock was set\n" in shown.out
     assert f"would write {new}: " in shown.out
     assert shown.out.endswith(
-        "set-up faults: none found by comparison with default (error 0.4 mm, expected about 0.42 mm)\n"
+        "set-up faults: none found by comparison with default (error 0.4 mm, expected about "
+        "0.42 mm)\n"
     )
     assert f"{new}, row 5: a jump of 30 mm" in shown.err
     monkeypatch.setattr(fit, lambda *_: ModelFit(54.0, 0.42, 10.0))

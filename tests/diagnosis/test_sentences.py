@@ -177,7 +177,7 @@ def decision(kind, *effects, reason=None, chances=CHANCES, statements=()) -> Dec
          "surgisoft next-experiment {model} {data} -o SCHEDULE.csv"),
         (decision("cannot_tell", reason="repeatability"), "record the same schedule twice before a",
          ""),
-        (decision("nothing_missing"), "these recordings show no missing effect (confidence 0.75); error",
+        (decision("nothing_missing"), "show no missing effect (confidence 0.75); error",
          ""),
     ],
 )  # fmt: skip

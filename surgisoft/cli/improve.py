@@ -72,11 +72,17 @@ def improve(
     from surgisoft.surrogate.checkpoint import save_model
 
     with progress("improve") as tell:
-        done = []
+        done, furthest = [], 0.0
 
         def after(each) -> None:
             done.append(each)
             tell(len(done), most + 2, each.step or each.verdict)
+
+        def within(share: float, total: float, note: str = "") -> None:
+            """Progress of a fit together with the network, which is part of a round."""
+            nonlocal furthest
+            furthest = max(furthest, len(done) + (share / total if total else 0.0))
+            tell(furthest, most + 2, note)
 
         try:
             result = improve_model(
@@ -85,7 +91,7 @@ def improve(
                 most,
                 after,
                 refit=refit,
-                refit_progress=tell,
+                refit_progress=within,
                 processes=REFIT_PROCESSES,
                 error_mm=model_error,
                 before=earlier,

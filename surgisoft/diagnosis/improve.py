@@ -52,6 +52,13 @@ MOST_EFFECTS = 6
 PLAUSIBLE_GAIN = 0.95
 """Least share of the fall of the squared error that an effect must keep at the end of its plausible
 range; it is then held there."""
+WORTH_A_TRIAL = 0.75
+"""Least share of what the named effect alone explains that an alternative to it explains alone."""
+MOST_ALTERNATIVES = 3
+"""Most alternatives that are fitted in place of an implausible effect."""
+NEARLY = 0.9
+"""Least share of the fall of the squared error by an implausible effect that a plausible one has to
+reach to take its place."""
 LIKELY = 0.5
 """Probability that an effect of the list is missing from which the most probable one is tried."""
 NETWORK = "network"
@@ -107,6 +114,30 @@ class _Made:
     """Residuals on the rows of its fit; None where the network was re-tuned since."""
     parameters: tuple[Parameter, ...] = ()
     in_words: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class _Tried:
+    """An effect, fitted beside those that were added before."""
+
+    name: str
+    """Name of the effect."""
+    fitted: Fitted | JointFit
+    """The model with it."""
+    fall: Fall
+    """Fall of the error on the training rows."""
+    doubt: str
+    """Why it is not added; empty where it may be."""
+
+    @property
+    def strange(self) -> str:
+        """That the error falls by it with implausible values alone; empty where they are plausible,
+        or where it does not fall."""
+        return _implausible(self.name, self.fall, self.fitted.parameters, lambda p: p.plausible)
+
+    def gives_way_to(self, other: "_Tried") -> bool:
+        """Whether another effect does nearly as much, with plausible values."""
+        return not (other.doubt or other.strange) and _as_good(other.fall, self.fall, NEARLY)
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,6 +306,7 @@ def improve(
     diagnoses: list[Diagnosis] = []
     added: list[str] = []
     anew: list[str] = []  # of these, what was fitted in another form
+    trained = False  # whether the network was trained on these rows
 
     def note(done: Round) -> None:
         rounds.append(done)
@@ -318,9 +350,40 @@ def improve(
         note(replace(_step(current, name, found, fall.after), anew=True))
         return True
 
+    def attempt(name: str, found: Diagnosis) -> _Tried:
+        """Fit an effect beside those that were added; together with the network where the diagnosis
+        did so and that leaves less."""
+        posed = problem.with_model(made[-1].model)
+        fitted: Fitted | JointFit
+        together = found.refit is not None and found.refit.winner == name
+        if found.refit is not None and together and refit == "auto" and not trained:
+            plain_mm = apart_mm(posed, [*added, name])
+            together = plain_mm is None or plain_mm > found.refit.of(name).heldout_rmse_mm
+        if found.refit is not None and together:
+            validated = found.refit.of(name)
+            trained_with = [*in_front(added), name]
+            fitted = fit_together(posed, trained_with, validated, progress=refit_progress)
+            fitted = fitted.beside(made[-1].parameters, made[-1].in_words)
+        else:
+            fitted = fit_effects(posed, [*added, name])
+        fall = fall_of(posed, problem.with_model(fitted.model))
+        doubt = _doubt(name, fall, fitted.parameters)
+        if not doubt and isinstance(fitted, JointFit):
+            alone, both_ = (problem.with_model(each) for each in (fitted.alone, fitted.model))
+            doubt = _idle(name, fall_of(alone, both_))
+        tried = _Tried(name, fitted, fall, doubt)
+        if tried.strange and isinstance(fitted, Fitted):
+            held = fit_plausible(posed, fitted, [*added, name], name)
+            if held is not None:
+                less = fall_of(posed, problem.with_model(held.model))
+                held_doubt = _doubt(name, less, held.parameters)
+                if _as_good(less, fall) and not held_doubt:
+                    return _Tried(name, held, less, held_doubt)
+        return tried
+
     def add_effects() -> None:
-        nonlocal problem
-        going, trained = True, False  # whether the network was trained on these rows
+        nonlocal problem, trained
+        going = True
         while going and len(added) < most_effects:
             found = diagnosis_of(made[-1])
             diagnoses.append(found)
@@ -329,46 +392,37 @@ def improve(
             names = next_effects(found, added)
             going = False
             for name in names[: most_effects - len(added)]:
-                posed = problem.with_model(made[-1].model)
-                fitted: Fitted | JointFit
-                together = found.refit is not None and found.refit.winner == name
-                if found.refit is not None and together and refit == "auto" and not trained:
-                    plain_mm = apart_mm(posed, [*added, name])
-                    together = plain_mm is None or plain_mm > found.refit.of(name).heldout_rmse_mm
-                if found.refit is not None and together:
-                    validated = found.refit.of(name)
-                    trained_with = [*in_front(added), name]
-                    fitted = fit_together(posed, trained_with, validated, progress=refit_progress)
-                    fitted = fitted.beside(made[-1].parameters, made[-1].in_words)
-                else:
-                    fitted = fit_effects(posed, [*added, name])
-                fall = fall_of(posed, problem.with_model(fitted.model))
-                doubt = _doubt(name, fall, fitted.parameters)
-                if not doubt and isinstance(fitted, JointFit):
-                    alone, together_ = (
-                        problem.with_model(each) for each in (fitted.alone, fitted.model)
-                    )
-                    doubt = _idle(name, fall_of(alone, together_))
-                if doubt and fall.significant and isinstance(fitted, Fitted):
-                    tried = fit_plausible(posed, fitted, [*added, name], name)
-                    if tried is not None:
-                        less = fall_of(posed, problem.with_model(tried.model))
-                        if _as_good(less, fall) and not _doubt(name, less, tried.parameters):
-                            fitted, fall, doubt = tried, less, ""
-                if doubt:
-                    current = replace(current, sentence=f"{current.sentence}; but {doubt}")
+                if name in added:  # in the place of another one of the same diagnosis
+                    continue
+                tried = attempt(name, found)
+                if tried.strange:
+                    rivals = (attempt(each, found) for each in alternatives(found, name, added))
+                    other = next(filter(tried.gives_way_to, rivals), None)
+                    if other is not None:
+                        why = f"{other.name} in its place: {tried.strange}"
+                        current = replace(current, sentence=f"{current.sentence}; {why}")
+                        tried = other
+                if tried.doubt:
+                    current = replace(current, sentence=f"{current.sentence}; but {tried.doubt}")
                     continue
                 going = True
-                added.append(name)
+                added.append(tried.name)
                 known = made[-1].known
-                if isinstance(fitted, JointFit):
+                if isinstance(tried.fitted, JointFit):
                     trained = True
-                    known = fitted.model.training_residuals
-                    discrepancy = model_discrepancy(fitted.model, problem.noise_mm)
+                    known = tried.fitted.model.training_residuals
+                    discrepancy = model_discrepancy(tried.fitted.model, problem.noise_mm)
                     problem = replace(problem, discrepancy_mm=discrepancy)
-                made.append(_Made(fitted.model, known, fitted.parameters, fitted.in_words))
-                note(replace(_step(current, name, found, fall.after), together=together))
-                current = replace(current, sentence=f"named beside {name} by the same diagnosis")
+                made.append(
+                    _Made(tried.fitted.model, known, tried.fitted.parameters, tried.fitted.in_words)
+                )
+                together = isinstance(tried.fitted, JointFit)
+                note(
+                    replace(_step(current, tried.name, found, tried.fall.after), together=together)
+                )
+                current = replace(
+                    current, sentence=f"named beside {tried.name} by the same diagnosis"
+                )
             if not going and not names:
                 going = in_another_form(found, current)
             if not going:
@@ -452,18 +506,43 @@ def next_effects(found: Diagnosis, added: Sequence[str] = ()) -> tuple[str, ...]
     return left[:1] if kind == "ambiguous" else left
 
 
-def _as_good(held: Fall, free: Fall) -> bool:
-    """Whether an effect held at its plausible end does nearly all that it does beyond it."""
+def _as_good(held: Fall, free: Fall, share: float = PLAUSIBLE_GAIN) -> bool:
+    """Whether the squared error falls by nearly as much: in the plausible range as beyond it, or by
+    another effect."""
     gains = [one.before**2 - one.after**2 for one in (held, free)]
-    return gains[0] >= PLAUSIBLE_GAIN * gains[1]
+    return gains[0] >= share * gains[1]
+
+
+def alternatives(found: Diagnosis, name: str, added: Sequence[str] = ()) -> list[str]:
+    """Effects that alone explain nearly as much as the named one in a diagnosis: those that are
+    named beside it, then the others, best first.
+
+    They are tried where the named one fits with implausible values only: what a lag of the line
+    leaves may look most like inertia, with more than the whole of the arm swinging.
+    """
+    gains = {row.effect: row.gain_alone for row in found.ranking if row.effect not in added}
+    least = WORTH_A_TRIAL * gains.pop(name, float("inf"))
+    as_good = [other for other, gain in gains.items() if gain >= least]
+    as_good.sort(key=lambda other: (other not in found.verdict.effects, -gains[other]))
+    return as_good[:MOST_ALTERNATIVES]
 
 
 def _doubt(name: str, fall: Fall, parameters: tuple[Parameter, ...]) -> str:
     """Why an effect is not added, whatever the diagnosis says; empty where it may be."""
     if not fall.significant:
         return f"{name}, fitted through the whole model, does not lower the error"
-    wrong = [p for p in parameters if p.effect == name and not p.may_be_plausible]
-    if not wrong:
+    return _implausible(name, fall, parameters, lambda p: p.may_be_plausible)
+
+
+def _implausible(
+    name: str,
+    fall: Fall,
+    parameters: tuple[Parameter, ...],
+    plausible: Callable[[Parameter], bool],
+) -> str:
+    """That the error falls by an effect with an implausible value; empty where that is not so."""
+    wrong = [p for p in parameters if p.effect == name and not plausible(p)]
+    if not wrong or not fall.significant:
         return ""
     low, high = wrong[0].plausible_range
     return (
@@ -492,8 +571,9 @@ def _interrupted(steps: list[Round]) -> Round:
 
 def _step(current: Round, name: str, found: Diagnosis, error_mm: float) -> Round:
     """The round in which the named effect was added."""
-    competing = found.verdict.effects[1:] if found.verdict.kind == "ambiguous" else ()
+    either = found.verdict.effects if found.verdict.kind == "ambiguous" else ()
+    competing = tuple(other for other in either if other != name)
     sure = next((row.confidence for row in found.ranking if row.effect == name), None)
     return replace(
-        current, step=name, competing=tuple(competing), confidence=sure, error_training_mm=error_mm
+        current, step=name, competing=competing, confidence=sure, error_training_mm=error_mm
     )

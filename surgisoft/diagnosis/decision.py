@@ -917,7 +917,7 @@ def statements(
         add("several", chances.two, pair, value + (1.0 - known) * worth.needless_name)
     quiet, unknown = chances.nothing + chances.network, chances.unknown
     if claimable(evidence, claim):
-        add("nothing_missing", (), quiet, quiet + (1.0 - quiet) * worth.wrong_nothing)
+        add("nothing_missing", (), quiet, worth_of_nothing(quiet, worth))
     if unknown >= quiet:
         # Not where "nothing" is more probable and only not to be claimed.
         add("unknown_effect", (), unknown, unknown + (1.0 - unknown) * worth.wrong_unknown)
@@ -927,6 +927,11 @@ def statements(
         off = quiet if static else chances.network
         add("surrogate_undertrained", (), off, off + (1.0 - off) * worth.wrong_network)
     return tuple(sorted(found, key=lambda each: -each.worth))
+
+
+def worth_of_nothing(quiet: float, worth: Worth = WORTH) -> float:
+    """Worth of the statement that nothing is missing; quiet: its probability."""
+    return quiet + (1.0 - quiet) * worth.wrong_nothing
 
 
 def decide(
@@ -978,5 +983,21 @@ def reason_of(evidence: Evidence, chances: Probabilities) -> Reason:
         return "network"
     elif evidence.error_over_validated <= CLAIM.most_over_validated and memory >= LEARNED:
         return "learned"
+    return _few_or_schedule(evidence)
+
+
+def _few_or_schedule(evidence: Evidence) -> Reason:
+    """The reason that lies in the recordings."""
     few = FEW_PAIRED_MOTIONS if evidence.paired else FEW_MOTIONS
     return "few_data" if evidence.motions < few else "schedule"
+
+
+def of_change(decision: Decision, evidence: Evidence) -> Decision:
+    """The same about what has changed since recordings that the model describes.
+
+    The model is older than the change and has learned nothing of it.
+    """
+    if decision.reason != "learned":
+        return decision
+    off = decision.kind == "surrogate_undertrained"
+    return replace(decision, reason=None if off else _few_or_schedule(evidence))

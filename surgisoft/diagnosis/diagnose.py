@@ -46,6 +46,8 @@ from surgisoft.diagnosis.decision import (
     Statement,
     claimable,
     decide,
+    of_change,
+    worth_of_nothing,
 )
 from surgisoft.diagnosis.design.next_experiment import Experiment, Recommendation, recommend
 from surgisoft.diagnosis.design.schedules import SETUPS
@@ -127,7 +129,7 @@ REASONS = {
     "a change, so that these differences are known",
     "before": "the model does not describe the recordings from before the change",
     "few_data": "the recordings contain too few different motions",
-    "schedule": "several causes explain these recordings about equally well, and none well enough",
+    "schedule": "these recordings make no cause probable enough to be named",
 }
 """Why a diagnosis cannot tell, or why it calls the model off, in words; {size}: the error beside
 the validated one (`ErrorLevels.size`)."""
@@ -428,7 +430,9 @@ def diagnose_change(
     if both.strange is not None:
         return without_before(both)
     found, not_testable = findings_of(problem, report, without)
-    result = replace(result_of(found), not_testable=not_testable)
+    evidence = evidence_of(found)
+    decision = of_change(decide(evidence), evidence)
+    result = replace(result_of(found, decision, evidence), not_testable=not_testable)
     result = with_less(since(result, both, found), found)
     return with_axis(result, problem) if result.verdict.kind == "unknown_effect" else result
 
@@ -592,7 +596,7 @@ def with_refit(result: Diagnosis, joint: Refit, problem: Problem) -> Diagnosis:
         if evidence is not None and chances is not None and tried.issuperset(verdict.effects):
             quiet = chances.nothing + chances.network
             none = Decision("cannot_tell", (), quiet, chances, "schedule")
-            if claimable(evidence):
+            if claimable(evidence) and worth_of_nothing(quiet) > 0.0:
                 none = Decision("nothing_missing", (), quiet, chances)
             if verdict.effects or verdict.reason == "learned":
                 sentence = sentence_of(none, result.error_mm, [result.error_mm.before])
@@ -617,14 +621,17 @@ def _as_fitted(row: Ranked, joint: Refit) -> Ranked:
     return replace(row, parameters=fitted.parameters, in_words=fitted.in_words)
 
 
-def result_of(found: Findings, decision: Decision | None = None) -> Diagnosis:
+def result_of(
+    found: Findings, decision: Decision | None = None, evidence: Evidence | None = None
+) -> Diagnosis:
     """The diagnosis that the findings amount to.
 
-    decision: what was decided from other evidence; None: it is decided from the findings.
+    decision: what was decided from other evidence; None: it is decided from the findings. evidence:
+    that of the findings, where it is known.
     """
     problem = found.problem
     best = best_achievable(problem, found.box, found)
-    evidence = evidence_of(found)
+    evidence = evidence or evidence_of(found)
     decision = decision or decide(evidence)
     in_fit = problem.in_fit
     where = LEFT_OUT if in_fit else HELD_OUT
@@ -673,7 +680,7 @@ def result_of(found: Findings, decision: Decision | None = None) -> Diagnosis:
         ),
         probabilities=decision.probabilities,
         statements=decision.statements,
-        next_command=next_command(decision),
+        next_command=next_command(decision, problem.model.trainable),
         in_fit=in_fit,
     )
 
@@ -937,18 +944,26 @@ def _why(reason: str, levels: ErrorLevels, static: bool) -> str:
 
 
 def _most_probable(decision: Decision) -> str:
-    """The two most probable statements in words, those about one effect or none first."""
-    single = [one for one in decision.statements if one.kind in MENTIONED]
-    single.sort(key=lambda one: -one.probability)
-    texts = [
-        f"{MENTIONED[one.kind].format(' and '.join(one.effects))} {one.probability:.2f}"
-        for one in single[:2]
-    ]
-    return ", ".join(texts)
+    """The two most probable statements about one effect, two, or none, in words; empty where none
+    could be made."""
+    if not decision.statements:
+        return ""
+    said = {
+        MENTIONED[one.kind].format(" and ".join(one.effects)): one.probability
+        for one in decision.statements
+        if one.kind in MENTIONED
+    }
+    for effect, chance in decision.probabilities.effects.items():
+        said.setdefault(MENTIONED["identified"].format(effect), chance)
+    most = sorted(said.items(), key=lambda each: -each[1])
+    return ", ".join(f"{words} {chance:.2f}" for words, chance in most[:2])
 
 
-def next_command(decision: Decision) -> str:
-    """Command to run after a result, with `{model}`, `{data}` and `{before}` for the files."""
+def next_command(decision: Decision, trainable: bool = True) -> str:
+    """Command to run after a result, with `{model}`, `{data}` and `{before}` for the files.
+
+    trainable: whether the model can be trained on together with effects.
+    """
     kind, names = decision.kind, decision.effects
     if kind in ("identified", "several"):
         return (
@@ -963,6 +978,8 @@ def next_command(decision: Decision) -> str:
         return plan
     if decision.reason == "network" or (kind == "surrogate_undertrained" and not decision.reason):
         return "surgisoft fit {data} -o NEW"
+    if decision.reason == "learned" and trainable:
+        return "surgisoft diagnose {model} {data} --refit always"
     if decision.reason == "learned":
         known = known_effects()
         inside = [n for n in decision.probabilities.effects if known[n].stage in FRONT]

@@ -24,6 +24,7 @@ from surgisoft.diagnosis.decision import (
     decide,
     features_of,
     load_decision,
+    of_change,
     probabilities,
     reason_of,
     statements,
@@ -126,6 +127,20 @@ def test_why_it_cannot_be_told(changes, reason):
     quiet = given_odds(missing=0.0, known=-0.5)
     found = decide(replace(GOOD, **changes), quiet, Worth(wrong_network=-4.0))
     assert (found.kind, found.reason) == ("cannot_tell", reason)
+
+
+def test_a_model_from_before_a_change_has_learned_nothing_of_it():
+    evidence = replace(GOOD, error_over_validated=1.0)
+    quiet = given_odds(missing=0.0, known=-0.5)
+    for motions, reason in ((200, "schedule"), (12, "few_data")):
+        seen = replace(evidence, motions=motions)
+        found = decide(seen, quiet, Worth(wrong_network=-4.0))
+        assert found.reason == "learned"
+        assert of_change(found, seen) == replace(found, reason=reason)
+    off = replace(found, kind="surrogate_undertrained")
+    assert of_change(off, evidence).reason is None
+    other = replace(found, reason="network")
+    assert of_change(other, evidence) == other
 
 
 @pytest.mark.parametrize(

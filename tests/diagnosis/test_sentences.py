@@ -19,13 +19,16 @@ from surgisoft.diagnosis.decision import (
 )
 from surgisoft.diagnosis.design.schedules import SETUPS
 from surgisoft.diagnosis.diagnose import (
+    Diagnosis,
     ErrorLevels,
     Ranked,
+    Verdict,
     effect_left,
     nearest,
     next_command,
     periodic,
     sentence_of,
+    with_refit,
 )
 from surgisoft.diagnosis.estimation.intervals import Parameter
 from surgisoft.diagnosis.improve import Improvement
@@ -35,6 +38,7 @@ from surgisoft.diagnosis.weight import under_weight
 from surgisoft.errors import InputError
 from surgisoft.surrogate.callables.named import given_callable
 from tests.diagnosis.synthetic import recording, still_model, walk
+from tests.diagnosis.test_decision import QUIET
 
 
 def fall(before=0.5, after=0.2, **fields) -> Fall:
@@ -169,11 +173,11 @@ def decision(kind, *effects, reason=None, chances=CHANCES, statements=()) -> Dec
         (decision("surrogate_undertrained", reason="network"), "the model does not describe this a",
          "surgisoft fit {data} -o NEW"),
         (decision("surrogate_undertrained", reason="learned"), "has learned part of the missing ef",
-         "surgisoft fit {data} --inputs pressure --effects creep -o NEW"),
+         "surgisoft diagnose {model} {data} --refit always"),
         (decision("cannot_tell", reason="few_data", statements=STATEMENTS),
          "(most probable: creep is missing 0.40, nothing is missing 0.30); error 0.5 mm, floor 0.1",
          "surgisoft next-experiment {model} {data} --between creep drift -o SCHEDULE.csv"),
-        (decision("cannot_tell", chances=NONE), "several causes explain these recordings about",
+        (decision("cannot_tell", chances=NONE), "these recordings make no cause probable enough",
          "surgisoft next-experiment {model} {data} -o SCHEDULE.csv"),
         (decision("cannot_tell", reason="repeatability"), "record the same schedule twice before a",
          ""),
@@ -184,6 +188,37 @@ def decision(kind, *effects, reason=None, chances=CHANCES, statements=()) -> Dec
 def test_each_kind_of_result_has_its_sentence_and_its_next_command(given, sentence, command):
     assert sentence in sentence_of(given, LEVELS, [0.15])
     assert next_command(given) == command
+
+
+def test_a_model_that_cannot_be_trained_on_is_fitted_anew_where_it_has_learned_an_effect():
+    learned = decision("surrogate_undertrained", reason="learned")
+    fit_anew = "surgisoft fit {data} --inputs pressure --effects creep -o NEW"
+    assert next_command(learned, trainable=False) == fit_anew
+
+
+@pytest.mark.parametrize(("nothing", "kind"), [(0.5, "cannot_tell"), (0.8, "nothing_missing")])
+def test_without_a_winner_nothing_is_missing_only_where_that_is_probable_enough(nothing, kind):
+    """A wrong "nothing" costs twice what a right one is worth: two thirds are needed."""
+    chances = Probabilities(nothing - 0.1, 0.1, 0.0, {"creep": 1.0 - nothing}, 0.0, ())
+    named = Diagnosis(
+        Verdict("identified", ("creep",), ""), LEVELS, (), statistics=QUIET, probabilities=chances
+    )
+    joint = SimpleNamespace(
+        winner=None, candidates=[SimpleNamespace(effect="creep")], sentence="none does better"
+    )
+    found = with_refit(named, joint, None)
+    assert found.verdict.kind == kind
+    assert found.verdict.confidence == nothing
+    assert found.checks == ("none does better",)
+
+
+def test_what_cannot_be_told_mentions_the_two_most_probable_causes():
+    """Also an effect that no statement of its own could be made of."""
+    some = (Statement("identified", ("creep",), 0.4, 0.3), Statement("unknown_effect", (), 0.1, 0))
+    chances = Probabilities(0.1, 0.1, 0.1, {"creep": 0.4, "drift": 0.3}, 0.0, ())
+    given = decision("cannot_tell", reason="few_data", chances=chances, statements=some)
+    text = "(most probable: creep is missing 0.40, drift is missing 0.30); error"
+    assert text in sentence_of(given, LEVELS, [0.15])
 
 
 def test_the_effect_nearest_to_an_unknown_one_is_that_which_alone_explains_most():

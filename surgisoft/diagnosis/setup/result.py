@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from surgisoft.diagnosis.other_models import has_slope
-from surgisoft.diagnosis.residuals import EVERY_ROW, model_discrepancy, noise_of
+from surgisoft.diagnosis.residuals import EVERY_ROW, fit_of_model, model_discrepancy, noise_of
 from surgisoft.diagnosis.setup.alignment import HANDED, Frame, angle, shifted
 from surgisoft.diagnosis.setup.arrangements import units
 from surgisoft.diagnosis.setup.blind import Blind, blind_channel
@@ -76,9 +76,9 @@ class SetupResult:
     how_to_tell: str
     """How to find out which explanation is right; empty where there is one."""
     before_mm: float
-    """RMS error of the model as recorded, on the training rows, mm."""
+    """RMS error of the model as recorded, mm."""
     after_mm: float
-    """Held-out RMS error with the correction, mm."""
+    """RMS error with the correction, mm."""
     floor_mm: float
     """Noise floor, mm."""
     recordings: tuple[str, ...]
@@ -238,6 +238,13 @@ class _Report:
         if silent_model:
             text += f": the error is {before:.3g} mm as read and {after:.3g} mm with the correction"
         elif correctable:
+            # The search predicts without memory; what is said holds for the whole model.
+            read, right = self.recordings, [correction.applied(r) for r in self.recordings]
+            whole_model = [fit_of_model(self.model, each) for each in (read, right)]
+            before, after = (
+                level if fit is None else fit.rmse_mm
+                for fit, level in zip(whole_model, (before, after), strict=True)
+            )
             text += f": the correction reduces the error from {before:.3g} to {after:.3g} mm"
         return SetupResult(
             faults=tuple(faults),

@@ -9,6 +9,7 @@ import tomli_w
 
 from surgisoft.cli import run
 from surgisoft.diagnosis.setup import find_setup_faults
+from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.importing import import_files, load_map
 from surgisoft.measurement.recordings import load_recording, save_recording
 from surgisoft.surrogate.checkpoint import default_arm
@@ -67,6 +68,9 @@ def test_the_lines_of_the_map_mend_like_apply(name, tmp_path):
         [tmp_path / "raw.parquet"], load_map(str(tmp_path / "correction.toml")), None
     )[0]
     corrected = found.corrected([wrong])[0]
+    history = history_of([corrected])
+    apart = (default_arm().predict(history) - history.key_points).square().sum(-1)
+    assert found.after_mm == pytest.approx(float(apart.nanmean().sqrt()), rel=1e-3)
     np.testing.assert_allclose(part.recording.measured, corrected.measured, atol=5e-3)
     np.testing.assert_allclose(np.diff(part.recording.t_s), np.diff(corrected.t_s), atol=1e-9)
     np.testing.assert_allclose(part.recording.key_points_mm, corrected.key_points_mm, atol=2e-2)

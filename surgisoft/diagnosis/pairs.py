@@ -315,6 +315,8 @@ class Change:
             paired = f"no rows are paired with {names}"
             if few != "0 %":
                 paired = f"only {few} of the rows have the same actuation as {names}"
+            if self.paired_share >= LEAST_SHARE:  # not asked for, or too few for a check
+                paired = f"rows are not paired with {names}, though {few} have the same actuation"
             return f"{paired}: the model's residuals are compared with its residuals there"
         delays = sorted({f"{each.delay_s:z.2f} s" for each in self.stretches[:DELAYS_SHOWN]})
         return (
@@ -1076,7 +1078,7 @@ class BeforeAfter:
             before=pairs.before,
             paired_share=share,
             change_mm=float(np.sqrt(np.nanmean(square))),
-            per_key_point_mm=tuple(float(x) for x in np.sqrt(np.nanmean(square, axis=0))),
+            per_key_point_mm=tuple(rms_by_point(pairs.change_mm[training]).tolist()),
             repeatability_mm=float(np.sqrt(np.mean(pairs.repeatability_mm**2))),
             repeatability_source=pairs.source,
             free_mm=float(np.sqrt(np.mean(pairs.free_mm**2))),
@@ -1154,6 +1156,11 @@ class BeforeAfter:
                 f"of the change on them: {instead}; {again}",
             )
         share = float(self.pairs.paired[~self.table.held_out].mean())
+        if share >= LEAST_SHARE:
+            return (
+                f"{100 * share:.0f} % of the rows {same}, but these are fewer than the "
+                f"{LEAST_ROWS} that a paired difference needs: {instead}; record for longer",
+            )
         few = _enough(self.plain, self.pairs, asked=True)
         alone = ", or explain the change in these rows alone by --paired always" if few else ""
         return (f"{100 * share:.0f} % of the rows {same}: {instead}; {again}{alone}",)

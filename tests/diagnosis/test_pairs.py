@@ -14,7 +14,7 @@ from surgisoft.diagnosis.amend import amend
 from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Verdict, diagnose, since
 from surgisoft.diagnosis.known_error import known_error
 from surgisoft.diagnosis.pages import diagnosis as page
-from surgisoft.diagnosis.pairs import before_and_after
+from surgisoft.diagnosis.pairs import LEAST_ROWS, before_and_after
 from surgisoft.diagnosis.residuals import residual_table
 from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import make_protocol
@@ -342,6 +342,25 @@ def test_a_minute_of_pairs_is_explained_only_where_pairs_are_asked_for(model):
     assert before_and_after(table, [before], "always").used
     short = before_and_after(residual_table(model, after), [before])
     assert "--paired always" not in short.notes[0]
+
+
+def test_a_short_recording_of_the_same_motion_is_called_short(model):
+    """Not one with another actuation; and a key point that nobody saw is no warning of NumPy."""
+    before, after = made(smooth_walk(10), 0.0), made(smooth_walk(10), 0.0, rows=80, seed=7)
+    both = before_and_after(residual_table(model, [after]), [replace(before, name="early")])
+    (note,) = both.notes
+    assert note.startswith("100 % of the rows were recorded with the same actuation as early, but")
+    assert f"fewer than the {LEAST_ROWS} that a paired difference needs" in note
+    assert note.endswith("record for longer")
+    said = "rows are not paired with early, though 100 % have the same actuation: the model's"
+    assert both.change.sentence.startswith(said)
+    again = made(smooth_walk(10), 0.0, seed=7, name="unseen")
+    blind = again.key_points_mm.copy()
+    blind[:, 1] = np.nan
+    unseen = replace(again, key_points_mm=blind)
+    change = before_and_after(residual_table(model, [unseen]), [before]).change
+    assert change.per_key_point_mm[1] == 0.0
+    assert change.per_key_point_mm[0] > 0.0
 
 
 def test_nothing_is_paired_where_pairs_are_not_wanted(model):

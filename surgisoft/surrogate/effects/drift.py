@@ -181,7 +181,7 @@ class Drift(Effect):
             return [
                 Quantity("turn_in_10_min_rad", value_of(self.turn), "rad", -0.2, 0.2, held),
                 Quantity("shift_in_10_min_mm", value_of(self.shift), "mm", -10.0, 10.0, held),
-                Quantity("tau_s", tau, "s", 120.0, 1e6, "quicker is a misalignment"),
+                Quantity("tau_s", tau, "s", 30.0, 1e6, "quicker is a misalignment"),
                 Quantity("power", power, "", 0.3, 1.2, "Findley 1976, ch. 5: creep of plastics"),
             ]
         if self.kind == "actuation":

@@ -121,9 +121,15 @@ class Coupling(Memoryless):
         else:
             texts = ["each chamber loses {} of its push to every other one"]
         return [
-            Reading(text, 100 * share, "%", share, signed=True)
+            Reading(text, 100 * share, "%", share, signed=True, instead=_gained(text))
             for text, share in zip(texts, both, strict=True)
         ]
+
+
+def _gained(text: str) -> str:
+    """The words of a reading whose chambers gain push from others instead of losing it."""
+    gained = text.replace("loses {} of its push", "gains {} of push")
+    return gained.replace(" to ", " from ")
 
 
 def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:

@@ -77,11 +77,14 @@ class DeadZone(Memoryless):
         lost, unit = self.threshold.detach(), self.facts.unit
         sizes = lost.tolist()
         if self.each:
-            text = "chamber {chamber} loses {} of its push"
-            return each_chamber(text, (self.reach * lost).tolist(), unit, sizes)
+            text, more = (
+                "chamber {chamber} loses {} of its push",
+                "chamber {chamber} gains {} of push",
+            )
+            return each_chamber(text, (self.reach * lost).tolist(), unit, sizes, more)
         full = float(self.reach.mean())
-        text = "each chamber loses {} of its push"
-        return [Reading(text, full * sizes[0], unit, sizes[0], signed=True)]
+        text, more = "each chamber loses {} of its push", "each chamber gains {} of push"
+        return [Reading(text, full * sizes[0], unit, sizes[0], signed=True, instead=more)]
 
 
 def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:

@@ -6,7 +6,7 @@ those that recordings do not determine.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 MINOR = 0.25
 """Share of the largest reading below which one without an interval is not told: a first estimate
@@ -40,6 +40,9 @@ class Reading:
     most: float = math.inf
     """Largest value that makes sense; a larger one is not told."""
 
+    instead: str = ""
+    """Words for a negative value, which is then told without its sign; empty: `text`, with it."""
+
     def known(self, ends: tuple[float, float] | None) -> bool:
         """Whether its 95 % interval determines the value; true where none is at hand."""
         if not self.value <= self.most or (self.value < 0.0 and not self.signed):
@@ -55,6 +58,9 @@ class Reading:
         """The reading in words, with its interval where that is at hand."""
         digits = FIRST_DIGITS if ends is None else DIGITS
         unit, plus = f" {self.unit}" if self.unit else "", "{+}" in self.text
+        if self.instead and self.value < 0.0:
+            turned = replace(self, text=self.instead, value=-self.value, instead="")
+            return turned.said(None if ends is None else (-ends[1], -ends[0]))
         value = f"{_number(self.value, digits, plus)}{unit}"
         if ends is not None and ends[0] != ends[1]:
             low, high = (_number(end, digits, plus) for end in ends)
@@ -82,12 +88,16 @@ def in_words(
 
 
 def each_chamber(
-    text: str, values: Sequence[float], unit: str, sizes: Sequence[float]
+    text: str, values: Sequence[float], unit: str, sizes: Sequence[float], instead: str = ""
 ) -> list[Reading]:
-    """A signed reading of each chamber; text: words with `{chamber}` and `{}`."""
+    """A signed reading of each chamber; text, instead: words with `{chamber}` and `{}`."""
+    own = [
+        [words.replace("{chamber}", str(number)) for words in (text, instead)]
+        for number in range(1, len(values) + 1)
+    ]
     return [
-        Reading(text.replace("{chamber}", str(number)), value, unit, size, signed=True)
-        for number, (value, size) in enumerate(zip(values, sizes, strict=True), 1)
+        Reading(words, value, unit, size, signed=True, instead=other)
+        for (words, other), (value, size) in zip(own, zip(values, sizes, strict=True), strict=True)
     ]
 
 

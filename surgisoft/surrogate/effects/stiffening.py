@@ -128,13 +128,16 @@ class Stiffening(WallFibres, Memoryless):
             lost = 100 * (1 - bent / self.reach)
         alone, together = float(lost[:-1].diagonal().mean()), float(lost[-1].mean())
         texts = (
-            "at full load one chamber alone loses {} of its push",
-            "all chambers at once lose {}",
+            (
+                "at full load one chamber alone loses {} of its push",
+                "at full load one chamber alone gains {} of push",
+            ),
+            ("all chambers at once lose {}", "all chambers at once gain {}"),
         )
         values = (alone, together) if len(full) > 2 else (alone,)
         return [
-            Reading(text, value, "%", value, signed=True)
-            for text, value in zip(texts, values, strict=False)
+            Reading(text, value, "%", value, signed=True, instead=more)
+            for (text, more), value in zip(texts, values, strict=False)
         ]
 
 

@@ -219,3 +219,20 @@ def test_an_effect_of_a_user_says_its_single_numbers():
     said = super(type(effect), effect).readings()
     assert [each.text for each in said] == ["linear {}", "quadratic {}"]
     assert [each.unit for each in said] == ["rad", "rad"]
+
+
+def test_push_that_is_not_lost_is_gained():
+    """A negative loss is told as a gain, with the ends of its interval turned round."""
+    loss = Reading("chamber 4 loses {} of its push", 7.2, "%", signed=True, instead="it gains {}")
+    gain = replace(loss, value=-7.2)
+    assert loss.said((5.0, 9.0)) == "chamber 4 loses 7.2 % (95 %: 5 to 9) of its push"
+    assert gain.said((-9.0, -5.0)) == "it gains 7.2 % (95 %: 5 to 9)"
+    assert gain.said() == "it gains 7.2 %"
+    wall = make_effect("coupling", FACTS, pairs=True)
+    with torch.no_grad():
+        for parameter in wall.amplitudes().values():
+            parameter.fill_(-0.05)
+    assert in_words(wall.readings()).startswith("chamber 1 gains 10 % of push from chamber 2, ")
+    dead = with_amplitudes(make_effect("dead_zone", FACTS, each=True), threshold=[-0.1, 0.0, 0.1])
+    told = in_words(dead.readings())
+    assert told.startswith("chamber 1 gains ") and ", chamber 3 loses " in told

@@ -254,6 +254,8 @@ def _show(found) -> None:
             f"{row.effect:18s} {row.confidence:6.2f} {100 * row.gain_alone:6.1f}% "
             f"{100 * row.gain_unique:6.1f}% {row.heldout_rmse_mm:10.4f} [{low:.4f}, {high:.4f}] mm"
         )
+    if found.shown and error.discrepancy_alone is not None:
+        print(f"{'no effect':41s}{error.discrepancy_alone:11.4f} mm (model discrepancy alone)")
     for each in found.not_testable:
         print(f"not testable: {each.effect}: {each.reason}")
     if found.implausible:

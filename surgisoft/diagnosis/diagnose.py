@@ -987,6 +987,8 @@ def next_command(decision: Decision, trainable: bool = True) -> str:
         return f"surgisoft fit {{data}} --inputs pressure --effects {effects} -o NEW"
     if kind == "cannot_tell":
         return plan if between else "surgisoft next-experiment {model} {data} -o SCHEDULE.csv"
+    if kind == "unknown_effect":  # when and where along the body it acts
+        return "surgisoft compare {model} {data}{before} --report PAGE"
     return ""
 
 

@@ -112,6 +112,10 @@ ABOUT = 1.1
 MOSTLY = 0.5
 """Share of what is left in one line of its spectrum from which the motion is said to be periodic:
 most of it."""
+LOCAL = 3.0
+"""Ratio of the RMS error in the worst block of time to that of the median block from which the
+error is called local. On three arms of another physics, 36 blocks each, it was at most 2.5 where
+nothing had changed and at least 3.2 with a wall that the arm touched."""
 MOST_FITTED = 3
 """Most effects that a fit is recommended with; `fit` takes those that lower its held-out error."""
 REASONS = {
@@ -671,6 +675,7 @@ def result_of(
         checks=(
             *data_quality_warnings(problem),
             *told,
+            *(local_error(problem) if kind not in NAMING else ()),
             *would_explain(found, decision),
             *amplitudes_that_vary(evidence, decision),
         ),
@@ -789,6 +794,31 @@ def slipped(evidence: Evidence, recordings: int = 1) -> list[str]:
         f"key point k{evidence.shift_key_point} is shifted by {evidence.shift_mm:.3g} mm against "
         f"the others from {when}: its marker has probably slipped, so use the rows before that "
         "time or record again"
+    ]
+
+
+def local_error(problem: Problem) -> list[str]:
+    """Where the error is much larger than elsewhere, in words; empty where it is spread out.
+
+    An effect that acts in few postures, such as a contact, hardly shows in the mean of all rows.
+    """
+    if not problem.table.timed.all():
+        return []
+    square = np.nansum(np.square(problem.residual), axis=(1, 2))
+    rows = np.bincount(problem.block)
+    seen = np.flatnonzero(rows)
+    block_mm = np.sqrt(np.bincount(problem.block, square)[seen] / rows[seen])
+    block_mm /= math.sqrt(problem.residual.shape[1])
+    worst, typical = int(block_mm.argmax()), float(np.median(block_mm))
+    if block_mm[worst] <= LOCAL * typical:
+        return []
+    time = problem.time_s[problem.block == seen[worst]]
+    turn = ", all recordings in turn" * (len(problem.table.names) > 1)
+    return [
+        f"the error is local: from {time.min():.0f} to {time.max():.0f} s{turn}, it is "
+        f"{block_mm[worst]:.3g} mm, {block_mm[worst] / typical:.1f} times that of a typical block "
+        "of time, as where the arm touches something or a part gives way: look there (compare "
+        "--report)"
     ]
 
 

@@ -24,6 +24,7 @@ from surgisoft.diagnosis.diagnose import (
     Ranked,
     Verdict,
     effect_left,
+    local_error,
     nearest,
     next_command,
     periodic,
@@ -220,6 +221,27 @@ def test_what_cannot_be_told_mentions_the_two_most_probable_causes():
     given = decision("cannot_tell", reason="few_data", chances=chances, statements=some)
     text = "(most probable: creep is missing 0.40, drift is missing 0.30); error"
     assert text in sentence_of(given, LEVELS, [0.15])
+
+
+@pytest.mark.parametrize(("here_mm", "told"), [(4.1, 1), (3.9, 0)])
+def test_an_error_that_is_large_in_one_stretch_is_called_local(here_mm, told):
+    """Two key points, each off by 4 / 3 mm along one axis elsewhere; a fifth of the rows here."""
+    residual = np.zeros((50, 2, 3))
+    residual[..., 1] = 4.0 / 3.0
+    residual[20:30, :, 1] = here_mm
+    table = SimpleNamespace(timed=np.ones(50, bool), names=["one"])
+    some = SimpleNamespace(
+        residual=residual, block=np.arange(50) // 10, time_s=0.5 * np.arange(50), table=table
+    )
+    found = local_error(some)
+    assert len(found) == told
+    if told:
+        assert "from 10 to 14 s, it is 4.1 mm, 3.1 times that of a typical block" in found[0]
+        both = SimpleNamespace(timed=table.timed, names=["one", "two"])
+        several = SimpleNamespace(**{**vars(some), "table": both})
+        assert "from 10 to 14 s, all recordings in turn, it is" in local_error(several)[0]
+    untimed = SimpleNamespace(timed=np.zeros(50, bool), names=["one"])
+    assert local_error(SimpleNamespace(**{**vars(some), "table": untimed})) == []
 
 
 def test_the_effect_nearest_to_an_unknown_one_is_that_which_alone_explains_most():

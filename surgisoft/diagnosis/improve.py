@@ -52,10 +52,6 @@ MOST_EFFECTS = 6
 PLAUSIBLE_GAIN = 0.95
 """Least share of the fall of the squared error that an effect must keep at the end of its plausible
 range; it is then held there."""
-WORTH_A_TRIAL = 0.75
-"""Least share of what the named effect alone explains that an alternative to it explains alone."""
-MOST_ALTERNATIVES = 3
-"""Most alternatives that are fitted in place of an implausible effect."""
 NEARLY = 0.9
 """Least share of the fall of the squared error by an implausible effect that a plausible one has to
 reach to take its place."""
@@ -514,17 +510,16 @@ def _as_good(held: Fall, free: Fall, share: float = PLAUSIBLE_GAIN) -> bool:
 
 
 def alternatives(found: Diagnosis, name: str, added: Sequence[str] = ()) -> list[str]:
-    """Effects that alone explain nearly as much as the named one in a diagnosis: those that are
-    named beside it, then the others, best first.
+    """Effects that a diagnosis cannot tell from the named one, and that were not added.
 
     They are tried where the named one fits with implausible values only: what a lag of the line
-    leaves may look most like inertia, with more than the whole of the arm swinging.
+    leaves may look most like inertia, with more than the whole of the arm swinging. Other effects
+    are not, whatever they explain: on robots of another physics they took the place of effects that
+    were missing.
     """
-    gains = {row.effect: row.gain_alone for row in found.ranking if row.effect not in added}
-    least = WORTH_A_TRIAL * gains.pop(name, float("inf"))
-    as_good = [other for other, gain in gains.items() if gain >= least]
-    as_good.sort(key=lambda other: (other not in found.verdict.effects, -gains[other]))
-    return as_good[:MOST_ALTERNATIVES]
+    either = found.verdict.effects if found.verdict.kind == "ambiguous" else ()
+    others = dict.fromkeys((*either, *found.ambiguous_with))
+    return [other for other in others if other != name and other not in added]
 
 
 def _doubt(name: str, fall: Fall, parameters: tuple[Parameter, ...]) -> str:

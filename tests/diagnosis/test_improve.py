@@ -158,36 +158,30 @@ def test_an_effect_a_little_beyond_plausibility_is_held_at_its_end(recited):
     assert result.claimed
 
 
-def ranked(kind: str, named: tuple[str, ...], **gains: float) -> Diagnosis:
-    """A diagnosis that says so; gains: what each effect alone explains, best first."""
-    rows = [
-        Ranked(name, 0.1, gain, 0.0, 1.0, (0.0, 1.0), 1.0, 0.0, {}) for name, gain in gains.items()
-    ]
-    return replace(said(kind, *named), ranking=tuple(rows))
-
-
 def test_a_plausible_effect_takes_the_place_of_one_that_fits_beyond_plausibility(recited):
     """The lag of a line looks like inertia that no arm has: more than all of it swings."""
     truth = with_truth("line_lag", {"share": 1.0, "log_up": math.log(0.06), "log_down": 0.0})
-    gains = {"inertia": 0.95, "gain_mismatch": 0.9, "line_lag": 0.85, "payload": 0.1}
-    recited(ranked("identified", ("inertia",), **gains), said("nothing_missing"))
+    either = replace(said("ambiguous", "inertia", "line_lag"), ambiguous_with=("line_lag",))
+    recited(either, said("nothing_missing"))
     result = improve(bare_arm(), [measured_on(truth, rows=300)])
     assert [name for name, _ in result.steps if name != NETWORK] == ["line_lag"]
+    assert result.rounds[0].competing == ("inertia",)
     assert "line_lag in its place: inertia would lower the error" in result.rounds[0].sentence
     assert "only with an implausible" in result.rounds[0].sentence
     assert result.claimed
-    gains |= {"line_lag": 0.5}
-    recited(ranked("identified", ("inertia",), **gains), said("nothing_missing"))
+    recited(said("identified", "inertia"), said("nothing_missing"))
     alone = improve(bare_arm(), [measured_on(truth, rows=300)])
     assert [name for name, _ in alone.steps if name != NETWORK] == ["inertia"]
 
 
-def test_alternatives_are_those_named_beside_it_then_the_best_others():
-    gains = {"creep": 0.8, "drift": 0.79, "payload": 0.78, "twist": 0.7, "contact": 0.59}
-    found = ranked("ambiguous", ("creep", "twist"), **gains)
-    assert alternatives(found, "creep") == ["twist", "drift", "payload"]
-    assert alternatives(found, "creep", ["drift"]) == ["twist", "payload"]
-    assert alternatives(found, "softening") == []
+def test_alternatives_are_what_the_diagnosis_cannot_tell_from_the_effect():
+    either = replace(said("ambiguous", "creep", "twist"), ambiguous_with=("twist",))
+    assert alternatives(either, "creep") == ["twist"]
+    assert alternatives(either, "twist") == ["creep"]
+    assert alternatives(either, "creep", ["twist"]) == []
+    both = replace(said("several", "creep", "twist"), ambiguous_with=("drift",))
+    assert alternatives(both, "twist") == ["drift"]
+    assert alternatives(said("identified", "creep"), "creep") == []
 
 
 def test_the_loop_ends_when_an_effect_is_named_again_or_enough_were_added(recited):

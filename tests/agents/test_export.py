@@ -125,7 +125,7 @@ def test_other_programs_get_the_same_actions(policy, exported):
         export(policy, exported)
 
 
-@pytest.mark.parametrize("engine", ["torch", "onnx"])
+@pytest.mark.parametrize("engine", ["torch", "onnxruntime"])
 def test_the_exported_controller_does_on_the_rig_what_evaluate_does(engine, policy, exported):
     """To 1e-4 mm, on a robot that the model does not know, from measurements alone."""
     found = check_on_rig(Controller(exported, engine), policy.run.task(), policy, STRANGE, seed=4)
@@ -134,6 +134,16 @@ def test_the_exported_controller_does_on_the_rig_what_evaluate_does(engine, poli
     assert found.closed.commands_kPa < AGREE_KPA
     assert found.same.accepted
     assert found.passed
+
+
+def test_the_reference_evaluator_of_onnx_runs_the_file_too(policy, exported):
+    """The engine that needs no binary library, a hundred times slower: eight decisions."""
+    config = replace(STRANGE, settle_s=0.1)
+    episode = drive(policy.run.task(), policy, config, seed=4)
+    assert episode.decisions == 25
+    found = same_measurements(Controller(exported, "onnx"), episode, most=8)
+    assert found.points_mm < AGREE_MM
+    assert found.commands_kPa < AGREE_KPA
 
 
 @pytest.mark.parametrize("name", SHORT)

@@ -77,10 +77,10 @@ def gated(rows: int):
 @pytest.mark.parametrize(
     ("model", "recorded", "source"),
     [
-        ("default", lambda: [bench("leak", 3)], "sidecar"),
-        ("default", lambda: [bench("payload", 5, 800), bench("payload", 6, 700)], "sidecar"),
+        ("default", lambda: [bench("leak", 3, 1200)], "sidecar"),
+        ("default", lambda: [bench("payload", 5, 500), bench("payload", 6, 400)], "sidecar"),
         ("default", lambda: [replace(bench("hysteresis", 7, 6000), noise_mm=None)], "holds"),
-        (None, lambda: [gated(ROWS)], "second differences"),
+        (None, lambda: [gated(1000)], "second differences"),
     ],
     ids=["leak", "two recordings", "noise from holds", "second differences"],
 )

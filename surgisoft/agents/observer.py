@@ -64,6 +64,19 @@ class Order(NamedTuple):
     """(B, m) kPa: pressures expected at the end of the step."""
 
 
+class Lesson(NamedTuple):
+    """What one sample teaches of the disturbance of B arms; all in the world frame."""
+
+    now_mm: Tensor
+    """(B, n, 3) mm: the disturbance."""
+    lead_mm: Tensor
+    """(B, n, 3) mm: `ArmPart.lead_mm`."""
+    offset_mm: Tensor
+    """(B, n, 3) mm: the disturbance that is expected in the next step."""
+    memory: Adaptation
+    """What is known then."""
+
+
 class Observer:
     """Estimates one arm from measurements; a function of its arguments, batched, differentiable.
 
@@ -116,35 +129,67 @@ class Observer:
         target = pump.command(target, action, low, high)
         return Order(target, shift, pump.follow(part.pressure, target + shift, self.dt_s))
 
-    def begun(self, part: ArmPart, pressure: Tensor, points_mm: Tensor) -> ArmPart:
+    def lesson(self, part: ArmPart, pressure: Tensor, points_mm: Tensor) -> Lesson | None:
+        """What a sample teaches of the disturbance; the arguments are those of `begun`.
+
+        `begun`, `stepped` and `learned` find it themselves. Whoever calls several of them with one
+        sample, as a graph of all branches does, gives it to each. None for a filter.
+        """
+        if self.learner is None:
+            return None
+        turn = part.mount[:, :3, :3]
+        off = (frames.apply(part.mount, points_mm) - part.points_mm) @ turn
+        body = (part.points_mm - part.mount[:, None, :3, 3]) @ turn
+        found = self.learner.updated(part.plant.adaptation, off, pressure, body)
+        world = (each @ turn.mT for each in (found.now_mm, found.lead_mm, found.next_mm))
+        return Lesson(*world, found.memory)
+
+    def begun(
+        self, part: ArmPart, pressure: Tensor, points_mm: Tensor, lesson: Lesson | None = None
+    ) -> ArmPart:
         """The part at the begin of an episode, of which the last sample was measured just now.
 
-        pressure: (B, m) kPa; points_mm: (B, n, 3) mm, base frame, nan where one was lost. The whole
-        first innovation is taken over.
+        pressure: (B, m) kPa; points_mm: (B, n, 3) mm, base frame, nan where one was lost; lesson:
+        that of this sample where it is known already. The whole first innovation is taken over.
         """
-        return self._seen(replace(part, command=pressure), pressure, points_mm, begins=True)
+        part = replace(part, command=pressure)
+        return self._seen(part, pressure, points_mm, lesson, begins=True)
 
-    def stepped(self, part: ArmPart, order: Order, pressure: Tensor, points_mm: Tensor) -> ArmPart:
+    def stepped(
+        self,
+        part: ArmPart,
+        order: Order,
+        pressure: Tensor,
+        points_mm: Tensor,
+        lesson: Lesson | None = None,
+    ) -> ArmPart:
         """The part at the end of a step, whose last sample was measured just now.
 
         order: what was asked for the step; the other arguments are those of `begun`.
         """
         surprise = (pressure - order.expected_kPa) / self.arm.pneumatics.share(self.dt_s)
         shift = order.shift_kPa + self.gains.pump_gain * surprise
-        return self._seen(replace(part, command=order.target_kPa + shift), pressure, points_mm)
+        part = replace(part, command=order.target_kPa + shift)
+        return self._seen(part, pressure, points_mm, lesson)
 
-    def learned(self, part: ArmPart, pressure: Tensor, points_mm: Tensor) -> ArmPart:
+    def learned(
+        self, part: ArmPart, pressure: Tensor, points_mm: Tensor, lesson: Lesson | None = None
+    ) -> ArmPart:
         """The part before the episode, after a sample; the arguments are those of `begun`.
 
         Call it once in each step of a task while the arm is brought to its start, so that the
         disturbance is known when the episode begins. A filter has nothing to learn from that.
         """
-        if self.learner is None:
-            return part
-        return self._adapted(part, frames.apply(part.mount, points_mm), pressure)[1]
+        lesson = lesson or self.lesson(part, pressure, points_mm)
+        return part if lesson is None else _taught(part, lesson)
 
     def _seen(
-        self, part: ArmPart, pressure: Tensor, points_mm: Tensor, begins: bool = False
+        self,
+        part: ArmPart,
+        pressure: Tensor,
+        points_mm: Tensor,
+        lesson: Lesson | None,
+        begins: bool = False,
     ) -> ArmPart:
         """The part as estimated; its key points so far are the model's.
 
@@ -152,9 +197,10 @@ class Observer:
         (Kalata 1984), which follows a steady drift without lag.
         """
         seen, offset, plant = part.points_mm, part.offset_mm, part.plant
-        if self.learner is not None:
-            now, part = self._adapted(part, frames.apply(part.mount, points_mm), pressure)
-            seen, offset, plant = seen + now, part.offset_mm, part.plant
+        lesson = lesson or self.lesson(part, pressure, points_mm)
+        if lesson is not None:
+            part = _taught(part, lesson)
+            seen, offset, plant = seen + lesson.now_mm, part.offset_mm, part.plant
         elif self.gains.cameras:
             measured = frames.apply(part.mount, points_mm)
             surprise = torch.where(measured.isfinite(), measured - seen - offset, 0.0)
@@ -163,18 +209,8 @@ class Observer:
             seen, plant = seen + now, replace(plant, drift_mm=drift)
         return replace(part, seen_mm=seen, seen_kPa=pressure, offset_mm=offset, plant=plant)
 
-    def _adapted(self, part: ArmPart, measured: Tensor, pressure: Tensor) -> tuple[Tensor, ArmPart]:
-        """Disturbance (B, n, 3) mm, world frame, and the part that has learned from a sample.
 
-        measured: (B, n, 3) mm, world frame, nan where a key point was lost.
-        """
-        assert self.learner is not None
-        turn = part.mount[:, :3, :3]
-        off = (measured - part.points_mm) @ turn
-        body = (part.points_mm - part.mount[:, None, :3, 3]) @ turn
-        found = self.learner.updated(part.plant.adaptation, off, pressure, body)
-        now, lead, offset = (
-            each @ turn.mT for each in (found.now_mm, found.lead_mm, found.next_mm)
-        )
-        plant = replace(part.plant, adaptation=found.memory)
-        return now, replace(part, plant=plant, offset_mm=offset, lead_mm=lead)
+def _taught(part: ArmPart, lesson: Lesson) -> ArmPart:
+    """The part with what a sample teaches."""
+    plant = replace(part.plant, adaptation=lesson.memory)
+    return replace(part, plant=plant, offset_mm=lesson.offset_mm, lead_mm=lesson.lead_mm)

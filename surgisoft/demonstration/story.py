@@ -139,15 +139,16 @@ def _told(
     )
     log = cut.logs[str(policy)]
     write_replay(log, folder / "cut.rrd")
+    charts = episode_parts(log)[:-1]
     story.tell(
         f"evaluate {policy} --episodes 1 --replay cut.rrd",
         cut_sentence(cut),
-        _cut_parts(log, None),
+        _cut_parts(charts, None),
     )
     stages.stage(15, "step 1 of 5: picture of the replay")
     picture, no_picture = _replay_picture(folder / "cut.rrd", folder / "cut.png")
     if picture is not None:
-        story.show_more(_cut_parts(log, picture))
+        story.show_more(_cut_parts(charts, picture))
 
     stages.stage(20, "step 2 of 5: a robot is recorded")
     recorded()
@@ -319,7 +320,7 @@ class _Story:
         write_page(page, self.page)
 
 
-def _cut_parts(log, picture: Path | None) -> list[Part]:
+def _cut_parts(charts: Sequence[Part], picture: Path | None) -> list[Part]:
     """What step 1 shows: the replay's picture, and charts of the episode."""
     parts: list[Part] = [
         Text(
@@ -332,7 +333,7 @@ def _cut_parts(log, picture: Path | None) -> list[Part]:
     if picture is not None:
         shown = "The episode in the Rerun viewer, at two thirds of its time"
         parts.append(Picture.from_file(picture, shown, shown))
-    return [*parts, *episode_parts(log)[:-1]]
+    return [*parts, *charts]
 
 
 def _measured_parts(recording: Recording) -> list[Part]:

@@ -88,11 +88,11 @@ def test_a_changed_bench_is_the_rig_with_that_change(tmp_path):
 
 
 def brief(patch):
-    """Let a study look without cameras, in one recording, and in episodes of 4 s."""
+    """Let a study look without cameras, in one recording, and in episodes of half the time."""
     patch.setattr(hidden_effect_policies, "SIGHTS", ("blind",))
     patch.setattr(hidden_effect, "ORACLE_TAKES", 1)
     patch.setattr(
-        control_policies, "config_of", lambda task: with_fields(config_of(task), loop_s=4.0)
+        control_policies, "config_of", lambda task: with_fields(config_of(task), loop_s=8.0)
     )
 
 

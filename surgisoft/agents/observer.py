@@ -141,8 +141,10 @@ class Observer:
         off = (frames.apply(part.mount, points_mm) - part.points_mm) @ turn
         body = (part.points_mm - part.mount[:, None, :3, 3]) @ turn
         found = self.learner.updated(part.plant.adaptation, off, pressure, body)
-        world = (each @ turn.mT for each in (found.now_mm, found.lead_mm, found.next_mm))
-        return Lesson(*world, found.memory)
+        now, lead, offset = (
+            each @ turn.mT for each in (found.now_mm, found.lead_mm, found.next_mm)
+        )
+        return Lesson(now, lead, offset, found.memory)
 
     def begun(
         self, part: ArmPart, pressure: Tensor, points_mm: Tensor, lesson: Lesson | None = None

@@ -190,7 +190,7 @@ class Drift(Effect):
             return [
                 Quantity("gain_in_10_min_share", value_of(self.gain), "", -0.4, 0.4, part),
                 Quantity("offset_in_10_min_share", value_of(self.offset), "", -0.3, 0.3, part),
-                Quantity("tau_s", tau, "s", 300.0, 1e6, "quicker is another gain from the start"),
+                Quantity("tau_s", tau, "s", 30.0, 1e6, "quicker is another gain from the start"),
             ]
         rubber = "wide: an ideal rubber has 3 % in 10 K (modulus ~ T, Treloar 1975)"
         return [

@@ -79,7 +79,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import linalg
 from scipy.spatial import cKDTree
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from surgisoft.diagnosis.discrepancy import kernel
 from surgisoft.errors import InputError
@@ -379,7 +379,7 @@ class Whitening:
 def _upper(variance: np.ndarray, count: np.ndarray | float) -> np.ndarray:
     """Upper confidence bounds of variances that were estimated from `count` independent values."""
     count = np.maximum(count, 2.0)
-    return variance * count / chi2.ppf(1.0 - CONFIDENCE, count)
+    return variance * count / chdtri(count, CONFIDENCE)
 
 
 @dataclass(frozen=True, eq=False)

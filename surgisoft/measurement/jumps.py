@@ -15,7 +15,7 @@ themselves, by as much as the body does, nothing is said.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 WINDOW_S = 0.1
 """Length of each side of a jump, s: longer ones take the curvature of fast motion for jumps."""
@@ -146,9 +146,9 @@ def find_jumps(motion: Motion) -> Jumps:
     scale = float(np.square(motion.noise_mm[points]).sum()) * variance
     for quantile in QUANTILES:
         if whole.any():
-            chance = degrees / chi2.ppf(quantile, degrees)
+            chance = degrees / chdtri(degrees, 1.0 - quantile)
             scale = max(scale, float(np.quantile(energy.least[whole], quantile)) * chance)
-    limit = scale * chi2.isf(CHANCE, degrees) / degrees
+    limit = scale * chdtri(degrees, CHANCE) / degrees
     excess = np.where(whole, energy.least - np.maximum(energy.explained, size), 0.0)
     picked = _apart(excess, limit, run[moments], 2 * side)
     order = picked[np.argsort(-excess[picked], kind="stable")]

@@ -232,6 +232,23 @@ class Ranked:
 
 
 @dataclass(frozen=True)
+class ErrorAlong:
+    """RMS error of each of the B blocks of time of the diagnosed rows, with nothing added."""
+
+    from_s: tuple[float, ...]
+    """(B,) begin of each block, on the axis that charts and replays share, s."""
+    to_s: tuple[float, ...]
+    """(B,) end of each block, s."""
+    rmse_mm: tuple[float, ...]
+    """(B,) RMS distance over key points and rows, mm."""
+
+    @property
+    def typical_mm(self) -> float:
+        """Median over the blocks, mm."""
+        return float(np.median(self.rmse_mm))
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """Everything that a diagnosis found."""
 
@@ -275,6 +292,8 @@ class Diagnosis:
     """What candidates did that were fitted together with the network; None where none was."""
     in_fit: float | None = None
     """Share 0..1 of the rows looked at that the model was fitted to; None where it does not say."""
+    along: ErrorAlong | None = None
+    """The error (in a paired difference: the change) along the recordings; None without a clock."""
 
     @property
     def left_out(self) -> str:
@@ -666,6 +685,7 @@ def result_of(
         sentence += "".join(f"; {each}" for each in told)
         told = []
     plan = recommend(problem, effects).experiment if kind == "ambiguous" else None
+    along = error_along(problem)
     return Diagnosis(
         verdict=Verdict(kind, effects, sentence, round(sure, 4), decision.reason),
         error_mm=levels,
@@ -675,7 +695,7 @@ def result_of(
         checks=(
             *data_quality_warnings(problem),
             *told,
-            *(local_error(problem) if kind not in NAMING else ()),
+            *(local_error(along, recordings) if kind not in NAMING else ()),
             *would_explain(found, decision),
             *amplitudes_that_vary(evidence, decision),
         ),
@@ -687,6 +707,7 @@ def result_of(
         statements=decision.statements,
         next_command=next_command(decision, problem.model.trainable),
         in_fit=in_fit,
+        along=along,
     )
 
 
@@ -797,28 +818,37 @@ def slipped(evidence: Evidence, recordings: int = 1) -> list[str]:
     ]
 
 
-def local_error(problem: Problem) -> list[str]:
+def error_along(problem: Problem) -> ErrorAlong | None:
+    """The error of each block of time; None for samples without a clock."""
+    if not problem.table.timed.all():
+        return None
+    square = np.nansum(np.square(problem.residual), axis=(1, 2))
+    rows = np.bincount(problem.block)
+    blocks = np.flatnonzero(rows)
+    mean = np.bincount(problem.block, square)[blocks] / rows[blocks] / problem.residual.shape[1]
+    times = [problem.time_s[problem.block == block] for block in blocks]
+    return ErrorAlong(
+        from_s=tuple(float(each.min()) for each in times),
+        to_s=tuple(float(each.max()) for each in times),
+        rmse_mm=tuple(np.sqrt(mean).tolist()),
+    )
+
+
+def local_error(along: ErrorAlong | None, recordings: int = 1) -> list[str]:
     """Where the error is much larger than elsewhere, in words; empty where it is spread out.
 
     An effect that acts in few postures, such as a contact, hardly shows in the mean of all rows.
+    recordings: how many there are.
     """
-    if not problem.table.timed.all():
+    if along is None or max(along.rmse_mm) <= LOCAL * along.typical_mm:
         return []
-    square = np.nansum(np.square(problem.residual), axis=(1, 2))
-    rows = np.bincount(problem.block)
-    seen = np.flatnonzero(rows)
-    block_mm = np.sqrt(np.bincount(problem.block, square)[seen] / rows[seen])
-    block_mm /= math.sqrt(problem.residual.shape[1])
-    worst, typical = int(block_mm.argmax()), float(np.median(block_mm))
-    if block_mm[worst] <= LOCAL * typical:
-        return []
-    time = problem.time_s[problem.block == seen[worst]]
-    turn = ", all recordings in turn" * (len(problem.table.names) > 1)
+    worst = int(np.argmax(along.rmse_mm))
+    turn = ", all recordings in turn" * (recordings > 1)
     return [
-        f"the error is local: from {time.min():.0f} to {time.max():.0f} s{turn}, it is "
-        f"{block_mm[worst]:.3g} mm, {block_mm[worst] / typical:.1f} times that of a typical block "
-        "of time, as where the arm touches something or a part gives way: look there (compare "
-        "--report)"
+        f"the error is local: from {along.from_s[worst]:.0f} to {along.to_s[worst]:.0f} s{turn}, "
+        f"it is {along.rmse_mm[worst]:.3g} mm, {along.rmse_mm[worst] / along.typical_mm:.1f} times "
+        "that of a typical block of time, as where the arm touches something or a part gives way: "
+        "look there (compare --report)"
     ]
 
 

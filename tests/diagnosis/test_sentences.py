@@ -24,6 +24,7 @@ from surgisoft.diagnosis.diagnose import (
     Ranked,
     Verdict,
     effect_left,
+    error_along,
     local_error,
     nearest,
     next_command,
@@ -35,6 +36,7 @@ from surgisoft.diagnosis.estimation.intervals import Parameter
 from surgisoft.diagnosis.improve import Improvement
 from surgisoft.diagnosis.other_models import callable_arm, open_model, polynomial_of
 from surgisoft.diagnosis.pages.amendment import amend_page
+from surgisoft.diagnosis.pages.diagnosis import diagnosis_page
 from surgisoft.diagnosis.weight import under_weight
 from surgisoft.errors import InputError
 from surgisoft.surrogate.callables.named import given_callable
@@ -229,19 +231,26 @@ def test_an_error_that_is_large_in_one_stretch_is_called_local(here_mm, told):
     residual = np.zeros((50, 2, 3))
     residual[..., 1] = 4.0 / 3.0
     residual[20:30, :, 1] = here_mm
-    table = SimpleNamespace(timed=np.ones(50, bool), names=["one"])
-    some = SimpleNamespace(
-        residual=residual, block=np.arange(50) // 10, time_s=0.5 * np.arange(50), table=table
-    )
-    found = local_error(some)
+    rows = {"residual": residual, "block": np.arange(50) // 10, "time_s": 0.5 * np.arange(50)}
+    along = error_along(SimpleNamespace(table=SimpleNamespace(timed=np.ones(50, bool)), **rows))
+    assert along.from_s == (0.0, 5.0, 10.0, 15.0, 20.0)
+    assert along.to_s == (4.5, 9.5, 14.5, 19.5, 24.5)
+    assert along.rmse_mm == pytest.approx([4 / 3, 4 / 3, here_mm, 4 / 3, 4 / 3])
+    found = local_error(along)
     assert len(found) == told
     if told:
         assert "from 10 to 14 s, it is 4.1 mm, 3.1 times that of a typical block" in found[0]
-        both = SimpleNamespace(timed=table.timed, names=["one", "two"])
-        several = SimpleNamespace(**{**vars(some), "table": both})
-        assert "from 10 to 14 s, all recordings in turn, it is" in local_error(several)[0]
-    untimed = SimpleNamespace(timed=np.zeros(50, bool), names=["one"])
-    assert local_error(SimpleNamespace(**{**vars(some), "table": untimed})) == []
+        assert "from 10 to 14 s, all recordings in turn, it is" in local_error(along, 2)[0]
+    shown = Diagnosis(Verdict("nothing_missing", (), ""), LEVELS, (), along=along)
+    (picture,) = next(
+        part.parts
+        for part in diagnosis_page(shown, "x").parts
+        if getattr(part, "title", "") == "Along the recordings"
+    )
+    assert ("red: more than 3 times the median" in picture.alt) == bool(told)
+    untimed = SimpleNamespace(table=SimpleNamespace(timed=np.zeros(50, bool)), **rows)
+    assert error_along(untimed) is None
+    assert local_error(None) == []
 
 
 def test_the_effect_nearest_to_an_unknown_one_is_that_which_alone_explains_most():

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from surgisoft.diagnosis.decision import Probabilities
-from surgisoft.diagnosis.diagnose import Diagnosis
+from surgisoft.diagnosis.diagnose import LOCAL, Diagnosis
 from surgisoft.diagnosis.pairs import ChangeTrack
 from surgisoft.diagnosis.refit import Refit
 from surgisoft.diagnosis.setup import SetupFault, SetupResult
@@ -84,6 +84,8 @@ def diagnosis_page(found: Diagnosis, title: str, command: str = "") -> Page:
     else:
         if found.ranking:
             parts.append(Section("Effects", [effects_chart(found), _ranking(found)]))
+        if found.along is not None:
+            parts.append(Section("Along the recordings", [along_chart(found)]))
         if found.not_testable:
             rows = [(each.effect, each.reason) for each in found.not_testable]
             note = Text("These recordings cannot show these effects, so they are not ranked.")
@@ -353,6 +355,33 @@ def effects_chart(found: Diagnosis):
         axis.set_xlim(left=0)
         figure.legend(fontsize=8, loc="outside upper center", ncols=2)
         return chart(figure, f"{blocks.capitalize()} {what} with each effect")
+
+
+def along_chart(found: Diagnosis):
+    """Error, or change, of each block of time; the worst one marked where the error is local."""
+    from surgisoft.report.charts import AMBER, BLUE, GREEN, RED, chart, drawing, plt
+
+    along, paired = found.along, found.track is not None
+    assert along is not None
+    what = "change" if paired else "error"
+    local = [value > LOCAL * along.typical_mm for value in along.rmse_mm]
+    with drawing():
+        figure, axis = plt.subplots(figsize=(7.2, 2.2))
+        for begin, end, value, far in zip(
+            along.from_s, along.to_s, along.rmse_mm, local, strict=True
+        ):
+            axis.plot([begin, end], [value, value], c=RED if far else BLUE, lw=2.5)
+        axis.axhline(found.error_mm.floor, c=GREEN, lw=1, label="noise floor")
+        label = f"median of the blocks: {along.typical_mm:.3g} mm"
+        axis.axhline(along.typical_mm, c=AMBER, lw=1, ls="--", label=label)
+        axis.set_ylim(bottom=0)
+        axis.set_xlabel("time [s]")
+        axis.set_ylabel(f"RMS {what} [mm]")
+        axis.legend(fontsize=7)
+        caption = f"RMS {what} of each block of time"
+        if any(local):
+            caption += f"; red: more than {LOCAL:g} times the median"
+        return chart(figure, caption, caption)
 
 
 def write_report(found: Diagnosis, folder: Path, title: str, command: str = "") -> Path:

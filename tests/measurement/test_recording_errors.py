@@ -211,6 +211,8 @@ def test_binary_rubbish_below_a_good_header(tmp_path):
 def test_what_is_no_file(tmp_path):
     assert "no such file" in error_of(tmp_path / "none.csv")
     assert "no .csv or .parquet in this folder" in error_of(tmp_path)
+    (tmp_path / "config.json").write_text("{}")
+    assert "is a model, expected recordings; the model comes before them" in error_of(tmp_path)
     with pytest.raises(InputError, match="is a folder, expected a file"):
         load_recording(tmp_path)
     with pytest.raises(InputError, match="no recording given"):

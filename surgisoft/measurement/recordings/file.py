@@ -105,6 +105,8 @@ def _in_folder(folder: Path) -> list[Path]:
         for file in folder.iterdir()
         if file.suffix in SUFFIXES and file.is_file() and not file.name.startswith(".")
     )
+    if not files and (folder / "config.json").is_file():
+        raise InputError(f"{folder}: is a model, expected recordings; the model comes before them")
     if not files:
         raise InputError(f"{folder}: no .csv or .parquet in this folder, expected recordings")
     for before, after in itertools.pairwise(files):

@@ -161,7 +161,7 @@ CHANGE = SimpleNamespace(sentence="moved by 0.9 mm", stretches=())
 def diagnosis(**fields) -> SimpleNamespace:
     values = {
         "verdict": SimpleNamespace(kind="setup", sentence="the frame is turned"),
-        "error_mm": SimpleNamespace(before=0.5, floor=0.05, best_achievable=0.1), "track": None,
+        "error_mm": ErrorLevels(0.5, 0.05, 0.1, discrepancy_alone=0.45), "track": None,
         "setup": None, "next_command": "", "next_experiment": None, "refit": None, "checks": (),
         "shown": (), "not_testable": (), "implausible": (), "seconds": 1.5, "in_fit": 0.0,
         "left_out": "held-out blocks", "change": None, "in_words": (),
@@ -244,6 +244,7 @@ def test_diagnose_prints_candidates_and_the_next_step(bench, capsys, monkeypatch
     assert "creep, first estimate: half of it after 3 s\n" in out
     assert "check: the clock is even\n" in out
     assert re.search(r"creep +0\.90 +50\.0% +25\.0% +0\.1500 \[0\.1000, 0\.2000\] mm", out)
+    assert re.search(r"no effect +0\.4500 mm \(model discrepancy alone\)\n", out)
     assert "not testable: drift: too short" in out
     assert "not ranked, because of implausible parameters: payload, twist" in out
     assert "fitted together with the network, because a lag is close:" in out

@@ -137,7 +137,8 @@ def data_quality_warnings(problem: Problem) -> list[str]:
     absent = np.isnan(problem.measured)
     for point in np.flatnonzero(absent.any(2).all(0)):
         warnings.append(
-            f"key point k{point} is missing in every row: what moves it alone cannot be seen"
+            f"key point k{point} is missing in every row: an effect that moves it alone cannot be "
+            "seen"
         )
     missing = float(absent.mean())
     if missing > MOST_MISSING:

@@ -114,8 +114,9 @@ MOSTLY = 0.5
 most of it."""
 LOCAL = 3.0
 """Ratio of the RMS error in the worst block of time to that of the median block from which the
-error is called local. On three arms of another physics, 36 blocks each, it was at most 2.5 where
-nothing had changed and at least 3.2 with a wall that the arm touched."""
+error is called local. Chosen on three robots of a trial, 36 blocks each, between the largest ratio
+of an unchanged arm (2.5) and the least one of an arm that touched a wall (3.2). It adds a check,
+and no result depends on it."""
 MOST_FITTED = 3
 """Most effects that a fit is recommended with; `fit` takes those that lower its held-out error."""
 REASONS = {
@@ -133,7 +134,7 @@ REASONS = {
     "a change, so that these differences are known",
     "before": "the model does not describe the recordings from before the change",
     "few_data": "the recordings contain too few different motions",
-    "schedule": "these recordings make no cause probable enough to be named",
+    "schedule": "on these recordings no cause is probable enough to be named",
 }
 """Why a diagnosis cannot tell, or why it calls the model off, in words; {size}: the error beside
 the validated one (`ErrorLevels.size`)."""
@@ -246,6 +247,11 @@ class ErrorAlong:
     def typical_mm(self) -> float:
         """Median over the blocks, mm."""
         return float(np.median(self.rmse_mm))
+
+    @property
+    def local(self) -> tuple[bool, ...]:
+        """(B,) whether the error of a block is much larger than that of the median block."""
+        return tuple(value > LOCAL * self.typical_mm for value in self.rmse_mm)
 
 
 @dataclass(frozen=True)
@@ -524,8 +530,8 @@ def without_before(both: BeforeAfter) -> Diagnosis:
 
 
 def lacking_before(both: BeforeAfter, report: Progress) -> tuple[str, ...]:
-    """A note where the model lacks effects on the recordings from before the change already; else
-    none.
+    """A note where the model already lacks effects on the recordings from before the change; else
+    none, and none of recordings too short to tell.
 
     The paired difference takes the network's response for that of the arm: a lag that the arm had
     before changes what a further lag does.
@@ -533,18 +539,21 @@ def lacking_before(both: BeforeAfter, report: Progress) -> tuple[str, ...]:
     if both.strange is not None:
         return ()
     report(f"what the model lacks on {both.names}")
-    problem = with_known_residuals(both.earlier.training())
+    try:
+        problem = with_known_residuals(both.earlier.training())
+    except InputError:  # too few blocks of time
+        return ()
     verdict = result_of(findings_of(problem, lambda text: None, ())[0]).verdict
     if verdict.kind not in NAMING:
         return ()
     named = (" or " if verdict.kind == "ambiguous" else " and ").join(verdict.effects)
-    again = problem.in_fit and all(map(can_hide, verdict.effects))
+    together = problem.in_fit and all(map(can_hide, verdict.effects))
+    command = "surgisoft improve --refit always" if together else "surgisoft improve"
     return (
-        f"the model lacks {named} on the recordings from before the change already (error "
+        f"the model already lacks {named} on the recordings from before the change (error "
         f"{problem.rmse_mm:.3g} mm, floor {problem.floor_mm:.3g} mm), so the parameters of what "
-        "has changed may be off by more than their intervals say: run 'surgisoft improve"
-        f"{' --refit always' * bool(again)}' on the model and {both.names} first, and amend the "
-        "model that it writes",
+        f"has changed may be off by more than their intervals say: first run '{command}' on the "
+        f"model and {both.names}, then amend the model that it writes",
     )
 
 
@@ -826,7 +835,8 @@ def error_along(problem: Problem) -> ErrorAlong | None:
     rows = np.bincount(problem.block)
     blocks = np.flatnonzero(rows)
     mean = np.bincount(problem.block, square)[blocks] / rows[blocks] / problem.residual.shape[1]
-    times = [problem.time_s[problem.block == block] for block in blocks]
+    along_s = problem.table.along_s[problem.index.numpy()]
+    times = [along_s[problem.block == block] for block in blocks]
     return ErrorAlong(
         from_s=tuple(float(each.min()) for each in times),
         to_s=tuple(float(each.max()) for each in times),
@@ -840,15 +850,15 @@ def local_error(along: ErrorAlong | None, recordings: int = 1) -> list[str]:
     An effect that acts in few postures, such as a contact, hardly shows in the mean of all rows.
     recordings: how many there are.
     """
-    if along is None or max(along.rmse_mm) <= LOCAL * along.typical_mm:
+    if along is None or not any(along.local):
         return []
     worst = int(np.argmax(along.rmse_mm))
     turn = ", all recordings in turn" * (recordings > 1)
     return [
-        f"the error is local: from {along.from_s[worst]:.0f} to {along.to_s[worst]:.0f} s{turn}, "
-        f"it is {along.rmse_mm[worst]:.3g} mm, {along.rmse_mm[worst] / along.typical_mm:.1f} times "
-        "that of a typical block of time, as where the arm touches something or a part gives way: "
-        "look there (compare --report)"
+        f"the error is concentrated from {along.from_s[worst]:.0f} to {along.to_s[worst]:.0f} s"
+        f"{turn}: {along.rmse_mm[worst]:.3g} mm, {along.rmse_mm[worst] / along.typical_mm:.1f} "
+        "times the median of all blocks of time (possible causes: the arm touches something, a "
+        "part gives way); 'surgisoft compare --report' shows where on the body"
     ]
 
 

@@ -141,7 +141,7 @@ class ErrorInterval:
             each = self.growth[:1] if len(set(self.growth)) == 1 else self.growth
             growth = " ".join(f"{value:g}" for value in each)
             beyond = f"; wider by {growth} x distance to the training data"
-        few = f"; of fewer than {EXACT_GROUPS} their RMS errors are taken to be log-normal"
+        few = f"; fewer than {EXACT_GROUPS}, so their RMS errors are taken to be log-normal"
         if self.groups < LEAST_GROUPS:
             few = "; too few to know how much groups differ"
         few *= self.groups < EXACT_GROUPS

@@ -11,7 +11,14 @@ import torch
 
 from surgisoft.cli import run
 from surgisoft.diagnosis.amend import amend
-from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Verdict, diagnose, since
+from surgisoft.diagnosis.diagnose import (
+    Diagnosis,
+    ErrorLevels,
+    Verdict,
+    diagnose,
+    lacking_before,
+    since,
+)
 from surgisoft.diagnosis.known_error import known_error
 from surgisoft.diagnosis.pages import diagnosis as page
 from surgisoft.diagnosis.pairs import LEAST_ROWS, before_and_after
@@ -589,6 +596,12 @@ def test_the_amendment_of_such_a_change_is_warned_of(model):
     assert right.strange_in_words == ""
 
 
+def test_recordings_too_short_for_a_diagnosis_say_nothing_of_what_the_model_lacked(model):
+    short, after = made(smooth_walk(10), 0.0, rows=40), made(smooth_walk(12), 0.0, seed=7)
+    both = before_and_after(residual_table(model, [after]), [short])
+    assert lacking_before(both, lambda text: None) == ()
+
+
 @pytest.mark.parametrize("own", [(), (("creep", 1.5),)])
 def test_what_the_model_lacked_before_the_change_is_said(own):
     """An own creep is no change, but what changes acts through it."""
@@ -602,8 +615,8 @@ def test_what_the_model_lacked_before_the_change_is_said(own):
         assert notes == ()
         return
     (note,) = notes
-    assert note.startswith("the model lacks creep on the recordings from before the change already")
-    assert f"'surgisoft improve' on the model and {before.name} first" in note
+    assert note.startswith("the model already lacks creep on the recordings from before the change")
+    assert f"first run 'surgisoft improve' on the model and {before.name}, then" in note
 
 
 def test_one_recording_before_and_after_is_refused(model, tmp_path, capsys):

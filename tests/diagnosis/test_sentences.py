@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from surgisoft.diagnosis.amend import Amendment, Fall, Track
 from surgisoft.diagnosis.data_quality import LONG_ROWS, data_quality_warnings, thinning_notes
@@ -181,7 +182,7 @@ def decision(kind, *effects, reason=None, chances=CHANCES, statements=()) -> Dec
         (decision("cannot_tell", reason="few_data", statements=STATEMENTS),
          "(most probable: creep is missing 0.40, nothing is missing 0.30); error 0.5 mm, floor 0.1",
          "surgisoft next-experiment {model} {data} --between creep drift -o SCHEDULE.csv"),
-        (decision("cannot_tell", chances=NONE), "these recordings make no cause probable enough",
+        (decision("cannot_tell", chances=NONE), "on these recordings no cause is probable enough",
          "surgisoft next-experiment {model} {data} -o SCHEDULE.csv"),
         (decision("cannot_tell", reason="repeatability"), "record the same schedule twice before a",
          ""),
@@ -231,16 +232,19 @@ def test_an_error_that_is_large_in_one_stretch_is_called_local(here_mm, told):
     residual = np.zeros((50, 2, 3))
     residual[..., 1] = 4.0 / 3.0
     residual[20:30, :, 1] = here_mm
-    rows = {"residual": residual, "block": np.arange(50) // 10, "time_s": 0.5 * np.arange(50)}
-    along = error_along(SimpleNamespace(table=SimpleNamespace(timed=np.ones(50, bool)), **rows))
+    rows = {"residual": residual, "block": np.arange(50) // 10, "index": torch.arange(50)}
+    timed = SimpleNamespace(timed=np.ones(50, bool), along_s=0.5 * np.arange(50))
+    along = error_along(SimpleNamespace(table=timed, **rows))
     assert along.from_s == (0.0, 5.0, 10.0, 15.0, 20.0)
     assert along.to_s == (4.5, 9.5, 14.5, 19.5, 24.5)
     assert along.rmse_mm == pytest.approx([4 / 3, 4 / 3, here_mm, 4 / 3, 4 / 3])
     found = local_error(along)
     assert len(found) == told
     if told:
-        assert "from 10 to 14 s, it is 4.1 mm, 3.1 times that of a typical block" in found[0]
-        assert "from 10 to 14 s, all recordings in turn, it is" in local_error(along, 2)[0]
+        assert (
+            "concentrated from 10 to 14 s: 4.1 mm, 3.1 times the median of all blocks" in found[0]
+        )
+        assert "from 10 to 14 s, all recordings in turn: 4.1 mm" in local_error(along, 2)[0]
     shown = Diagnosis(Verdict("nothing_missing", (), ""), LEVELS, (), along=along)
     (picture,) = next(
         part.parts
@@ -432,7 +436,7 @@ def test_warnings_about_recordings_are_a_sentence_each():
     for fields, message in (
         ({}, None),
         ({"measured": holes}, "50 % of the key points are missing"),
-        ({"measured": lost}, "key point k1 is missing in every row: what moves it alone cannot"),
+        ({"measured": lost}, "key point k1 is missing in every row: an effect that moves it alone"),
         ({"motion": np.zeros(8, int)}, "their 8 blocks of time show 1 different motions"),
         ({"table": unknown}, "state noise_mm in the sidecar for a better noise floor"),
         (

@@ -216,7 +216,7 @@ INTERVAL = ErrorInterval(
     ("groups", "said"),
     [
         (3, "3 groups; too few to know how much groups differ; wider"),
-        (18, "18 groups; of fewer than 19 their RMS errors are taken to be log-normal; wider"),
+        (18, "18 groups; fewer than 19, so their RMS errors are taken to be log-normal; wider"),
         (19, "19 groups; wider"),
     ],
 )

@@ -364,11 +364,10 @@ def along_chart(found: Diagnosis):
     along, paired = found.along, found.track is not None
     assert along is not None
     what = "change" if paired else "error"
-    local = [value > LOCAL * along.typical_mm for value in along.rmse_mm]
     with drawing():
         figure, axis = plt.subplots(figsize=(7.2, 2.2))
         for begin, end, value, far in zip(
-            along.from_s, along.to_s, along.rmse_mm, local, strict=True
+            along.from_s, along.to_s, along.rmse_mm, along.local, strict=True
         ):
             axis.plot([begin, end], [value, value], c=RED if far else BLUE, lw=2.5)
         axis.axhline(found.error_mm.floor, c=GREEN, lw=1, label="noise floor")
@@ -379,7 +378,7 @@ def along_chart(found: Diagnosis):
         axis.set_ylabel(f"RMS {what} [mm]")
         axis.legend(fontsize=7)
         caption = f"RMS {what} of each block of time"
-        if any(local):
+        if any(along.local):
             caption += f"; red: more than {LOCAL:g} times the median"
         return chart(figure, caption, caption)
 

@@ -133,13 +133,14 @@ def diagnose(
         )
     warn_all(found.notes)
     data = " ".join(map(str, recordings))
-    # Predictions of `--before` come last; no command to run next takes those recordings with them.
+    # Predictions of `--before` come last.
     of_model = model_options((predictions or [])[: len(measured)], model_error)
     following = ""
     if found.next_command:
         command = found.command(str(model), data, " ".join(map(str, before or ())))
         predicted = bool(predictions) or model.suffix in (".csv", ".parquet")
-        following = _following(command, predicted, of_model)
+        of_all = model_options(predictions, model_error) if "--before" in command else of_model
+        following = _following(command, predicted, of_all)
     written = []
     if json_file:
         write_json(json_file, found.to_json())

@@ -118,7 +118,9 @@ def improve(
         title = f"What {model.name} lacks on {names}"
         # The model that the last diagnosis is of, if it is written.
         last = output if result.claimed else model
-        given = (" ".join(map(str, some)) for some in (recordings, before or ()))
+        # What was amended to a change is not compared with the recordings from before it again.
+        earlier_files = () if result.claimed else before or ()
+        given = (" ".join(map(str, some)) for some in (recordings, earlier_files))
         found = result.diagnoses[-1]
         command = with_effect_files(found.command(str(last), *given)) if found.next_command else ""
         written += write_improve_report(result, tables, report, title, command)

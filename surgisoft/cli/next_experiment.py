@@ -8,13 +8,15 @@ import typer
 from surgisoft.cli import app
 from surgisoft.cli.collect import check_new_recording, log_of, record_on, written_line
 from surgisoft.cli.files import check_folder, check_free
-from surgisoft.cli.inputs import check_model, read_recordings, warn_all
+from surgisoft.cli.inputs import check_model, read_before, read_recordings, warn_all
 from surgisoft.cli.options import (
     AnyModel,
+    Before,
     EffectFiles,
     Force,
     JsonFile,
     ModelError,
+    Paired,
     Predictions,
     complete_effects,
     model_options,
@@ -58,6 +60,8 @@ def next_experiment(
     as_it_stands: Annotated[
         bool, typer.Option("--as-it-stands", help="Propose no change of the experimental setup.")
     ] = False,
+    before: Before = None,
+    paired: Paired = "auto",
     predictions: Predictions = None,
     model_error: ModelError = None,
     record: Annotated[
@@ -89,6 +93,7 @@ def next_experiment(
         check_rig(rig)
     check_model(model, predictions)
     measured = read_recordings(recordings) if recordings else []
+    earlier = read_before(before, paired)
 
     from surgisoft.diagnosis.design.next_experiment import next_experiment as find_experiment
     from surgisoft.diagnosis.design.schedules import AS_IT_STANDS, SETUPS, schedule_text
@@ -105,17 +110,34 @@ def next_experiment(
             predictions=predictions,
             error_mm=model_error,
             progress=report,
+            before=earlier,
+            paired=paired,
         )
     warn_all(result.notes)
     write_atomically(output, schedule_text(result.protocol))
     if json_file:
         write_json(json_file, result.to_json())
+    given = predictions or []
+    of_recordings, of_before = given[: len(measured)], given[len(measured) :]
     # After a change that removes an effect, only the new recording counts.
-    kept = [] if result.by_hand else predictions or []
-    later = [*kept, Path("PREDICTIONS_OF_NEW.csv")] if predictions else None
-    _show(result, model, recordings or [], output, rig, record, model_options(later, model_error))
+    kept = [] if result.by_hand else of_recordings
+    later = [*kept, Path("PREDICTIONS_OF_NEW.csv"), *of_before] if predictions else None
+    compared = _compared(before, result.paired and not result.by_hand)
+    of_model = compared + model_options(later, model_error)
+    _show(result, model, recordings or [], output, rig, record, of_model)
     if record:
         _record(result, rig, output, record, force)
+
+
+def _compared(before: list[Path] | None, paired: bool) -> str:
+    """Options that compare the old and the new recording with those from before.
+
+    paired: whether the old ones were paired with them. The new schedule has no partner there, and
+    among paired differences its rows would not count.
+    """
+    if not before:
+        return ""
+    return f" --before {' '.join(map(str, before))}" + (" --paired never" if paired else "")
 
 
 def _show(

@@ -311,9 +311,9 @@ class Diagnosis:
     ) -> str:
         """`next_command` with its files, in words for those that are not given.
 
-        before: the recordings from before, which are left out where none were compared.
+        before: the recordings from before, which are left out where none were compared, or empty.
         """
-        option = f" --before {before}" if self.change is not None else ""
+        option = f" --before {before}" if self.change is not None and before else ""
         return self.next_command.format(model=model, data=data, before=option)
 
     @property
@@ -1042,8 +1042,10 @@ def next_command(decision: Decision, trainable: bool = True) -> str:
     if decision.reason == "repeatability":
         return ""
     between = names or tuple(decision.probabilities.effects)[:2]
-    plan = f"surgisoft next-experiment {{model}} {{data}} --between {' '.join(between)}"
-    plan = f"{plan} -o SCHEDULE.csv"
+    plan = "surgisoft next-experiment {model} {data}{before}"
+    if between:
+        plan += f" --between {' '.join(between)}"
+    plan += " -o SCHEDULE.csv"
     if kind == "ambiguous":
         return plan
     if decision.reason == "network" or (kind == "surrogate_undertrained" and not decision.reason):
@@ -1056,7 +1058,7 @@ def next_command(decision: Decision, trainable: bool = True) -> str:
         effects = " ".join(inside[:MOST_FITTED])
         return f"surgisoft fit {{data}} --inputs pressure --effects {effects} -o NEW"
     if kind == "cannot_tell":
-        return plan if between else "surgisoft next-experiment {model} {data} -o SCHEDULE.csv"
+        return plan
     if kind == "unknown_effect":  # when and where along the body it acts
         return "surgisoft compare {model} {data}{before} --report PAGE"
     return ""

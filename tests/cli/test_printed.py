@@ -661,7 +661,7 @@ def test_an_experiment_that_takes_something_away_is_told_by_hand(
     fields = {
         "name": "walk", "minutes": 5.0, "why": "it tells them apart", "steps": ["unmount it"],
         "protocol": commands, "options": "--payload 5", "removes": ("payload",), "pairs": [pair],
-        "separates": [], "open": (),
+        "separates": [], "open": (), "paired": False,
     }  # fmt: skip
     monkeypatch.setattr("surgisoft.cli.next_experiment.warn_all", lambda notes: None)
     for by_hand, said in (

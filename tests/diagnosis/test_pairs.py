@@ -11,6 +11,7 @@ import torch
 
 from surgisoft.cli import run
 from surgisoft.diagnosis.amend import amend
+from surgisoft.diagnosis.design.next_experiment import likely_competing, next_experiment
 from surgisoft.diagnosis.diagnose import (
     Diagnosis,
     ErrorLevels,
@@ -289,6 +290,32 @@ def test_payload_is_named_behind_a_wrong_network(rig_takes):
     assert result.model_error.before > 1.5 * result.held_out.before
 
 
+def test_the_next_experiment_is_about_what_has_changed(rig_takes, tmp_path, capsys):
+    """Behind a wrong network the change alone says which effects compete."""
+    before, after = rig_takes
+    model = bent_arm()
+    both = before_and_after(residual_table(model, [after]), [before])
+    changed = likely_competing(both.training())
+    assert "payload" in changed
+    save_model(model, tmp_path / "arm")
+    for each in rig_takes:
+        save_recording(each, tmp_path / f"{each.name}.parquet")
+    arm, data, earlier = (str(tmp_path / n) for n in ("arm", "after.parquet", "before.parquet"))
+    plan = ["next-experiment", arm, data, "--before", earlier, "--minutes", "6", "--as-it-stands"]
+    out, numbers = tmp_path / "plan.csv", tmp_path / "plan.json"
+    assert run([*plan, "-o", str(out), "--json", str(numbers)]) == 0
+    then = f"then: surgisoft diagnose {arm} {data} NEW.parquet --before {earlier}"
+    assert f"{then} --paired never\n" in capsys.readouterr().out
+    pairs = json.loads(numbers.read_text())["pairs"]
+    assert {name for pair in pairs for name in pair["effects"]} == set(changed)
+    between = ["--between", "payload", "misalignment", "-o", str(out), "--force"]
+    assert run([*plan, "--paired", "never", *between]) == 0
+    assert f"{then}\n" in capsys.readouterr().out
+    alone = ["next-experiment", arm, "--before", earlier, "-o", str(out), "--force"]
+    assert run(alone) == 2
+    assert "without those after it" in capsys.readouterr().err
+
+
 def drawn(found) -> tuple[list[str], str]:
     """Labels of the lines in the chart of the effects, and of what is explained of the change."""
     figures = []
@@ -557,6 +584,8 @@ def test_a_model_that_does_not_describe_before_is_no_reference_for_pairs_either(
     assert (found.verdict.kind, found.verdict.reason) == ("cannot_tell", "before")
     with pytest.raises(InputError, match="the model does not describe other"):
         amend(model, [after], ["misalignment"], before=[before])
+    with pytest.raises(InputError, match="the model does not describe other"):
+        next_experiment(model, [after], before=[before])
 
 
 def test_what_was_amended_is_not_sought_again_since_before(model, tmp_path, capsys):
@@ -574,6 +603,7 @@ def test_what_was_amended_is_not_sought_again_since_before(model, tmp_path, caps
         ["diagnose", new, later],
         ["amend", new, "--effect", "payload", "--data", later, "-o", str(tmp_path / "other")],
         ["improve", new, later, "-o", str(tmp_path / "other")],
+        ["next-experiment", new, later, "-o", str(tmp_path / "other.csv")],
     ):
         assert run([*command, "--before", earlier]) == 2
         error = capsys.readouterr().err
@@ -581,6 +611,7 @@ def test_what_was_amended_is_not_sought_again_since_before(model, tmp_path, caps
         assert "from before the change" in error
         assert error.count("\n") == 1
     assert not (tmp_path / "other").exists()
+    assert not (tmp_path / "other.csv").exists()
     assert run(["diagnose", new, later]) == 0
 
 

@@ -60,14 +60,16 @@ from surgisoft.diagnosis.inputs import (
     Recordings,
     identification_problem,
     open_inputs,
+    refuse_amended,
 )
 from surgisoft.diagnosis.other_models import is_predictions_file, open_model
-from surgisoft.diagnosis.residuals import Problem
+from surgisoft.diagnosis.pairs import BeforeAfter, Paired, before_and_after
+from surgisoft.diagnosis.residuals import Problem, Sealed, residual_table
 from surgisoft.diagnosis.weight import gravity_load
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.measurement.histories import STILL_SHARE
 from surgisoft.measurement.protocols import SIGNALS, Protocol
-from surgisoft.measurement.recordings import Recording
+from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.progress import Progress, Stages, silent
 from surgisoft.surrogate.callables.arm import arm_by_itself
 from surgisoft.surrogate.callables.named import given_callable
@@ -589,7 +591,10 @@ class Recommendation:
     isolability: Isolability | None = field(default=None, repr=False)
     """What the recordings and the experiment together say about the competing effects."""
     notes: tuple[str, ...] = ()
-    """Recordings under another direction of gravity, or beyond the range of the model's fit."""
+    """Recordings under another direction of gravity, or beyond the range of the model's fit; how
+    recordings from before were compared."""
+    paired: bool = False
+    """Whether the recordings so far count as paired differences to those from before."""
 
     @property
     def separates(self) -> tuple[tuple[str, str], ...]:
@@ -662,6 +667,8 @@ def next_experiment(
     predictions: Iterable[str | Path] | None = None,
     error_mm: float | None = None,
     progress: Progress = silent,
+    before: Recordings | None = None,
+    paired: Paired = "auto",
 ) -> Recommendation:
     """The experiment that best distinguishes competing effects (Box & Hill 1967).
 
@@ -676,7 +683,9 @@ def next_experiment(
     between: the competing effects; without them those that explain the recordings best, and
     without recordings all known ones.
     settings: names of the experimental setups that may be asked for.
-    reference: as for `diagnose`. progress: called with (done, total, note).
+    reference: as for `diagnose`. progress: called with (done, total, note). before: recordings
+    from before a change: what the arm did there as well is no part of the question; paired: as for
+    `diagnose`. Raises InputError where the model does not describe BEFORE.
     """
     given = [recordings] if isinstance(recordings, Recording | str | Path) else list(recordings)
     if not given:
@@ -685,18 +694,41 @@ def next_experiment(
                 "predictions are given without recordings; expected the recordings that they were "
                 "made for"
             )
+        if before is not None:
+            raise InputError(
+                "recordings from before a change are given without those after it; expected both"
+            )
         if callable(model) and not isinstance(model, ArmModel):
             model = arm_by_itself(given_callable(model))
         return propose(load_model(model), between, minutes, settings, progress)
-    arm, measured, _ = open_model(model, given, None, predictions, error_mm)
+    arm, measured, earlier = open_model(model, given, before, predictions, error_mm)
     arm, measured, notes = open_inputs(arm, measured)
-    problem = identification_problem(arm, measured, reference)
+    both = None
+    if earlier is None:
+        problem = identification_problem(arm, measured, reference)
+    else:
+        both = since_before(arm, measured, earlier, paired)
+        problem, notes = both.training(), (*notes, *both.notes)
     stages = Stages(progress, 1.0)
     if not between:
         between = likely_competing(problem, progress=stages.stage(1 / 3, "likely effects"))
     rest = stages.stage(1.0 - stages.done, "experiments")
     found = recommend(problem, between, minutes, settings, rest)
-    return replace(found, notes=notes)
+    return replace(found, notes=notes, paired=both is not None and both.used)
+
+
+def since_before(
+    model: ArmModel, after: list[Recording], before: Recordings, paired: Paired
+) -> BeforeAfter:
+    """Training rows of recordings after a change, compared with those from before as `diagnose`
+    does. Raises InputError where the model does not describe BEFORE."""
+    earlier = load_recordings(before)
+    refuse_amended(model, after, earlier)
+    table = residual_table(model, Sealed(after).training)
+    both = before_and_after(table, earlier, paired)
+    if both.strange is not None:
+        raise InputError(both.strange_in_words)
+    return both
 
 
 def recommend(

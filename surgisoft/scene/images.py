@@ -330,7 +330,9 @@ def draw_rows(
     for b in range(first, last):
         if not finite[b]:
             continue
-        z[:] = far
+        for i in range(height):
+            for j in range(width):
+                z[i, j] = far[i, j]
         who[:] = -1
         for n in range(count):
             _raster_body(maps[n, b], bodies, n, focal, xs, ys, z, who, place, share, stack, planes)

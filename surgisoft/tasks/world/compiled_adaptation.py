@@ -48,7 +48,9 @@ def learn(
     rows, white, grown = np.empty((size, k)), np.empty(size), np.empty(k)
     rate, innovation, startling, quietest, liveliest = rules
     for b in range(count):
-        rows[:] = inputs[b]
+        for d in range(size):
+            for j in range(k):
+                rows[d, j] = inputs[b, d, j]
         _product(rows, covariance[b], across)
         for d in range(size):
             for e in range(d + 1):

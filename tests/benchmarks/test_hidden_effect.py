@@ -22,7 +22,7 @@ from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, save_model
 from surgisoft.tasks.registry import config_of, with_fields
 
-SMALL = StudyConfig(steps=3072, episodes=1, samples=2400)
+SMALL = StudyConfig(steps=3072, episodes=1, samples=1600)
 
 
 def nothing(done, total, note=""):
@@ -88,11 +88,11 @@ def test_a_changed_bench_is_the_rig_with_that_change(tmp_path):
 
 
 def brief(patch):
-    """Let a study look without cameras, in one recording, and in episodes of half the time."""
+    """Let a study look without cameras, in one recording, and in episodes of a quarter of the time."""
     patch.setattr(hidden_effect_policies, "SIGHTS", ("blind",))
     patch.setattr(hidden_effect, "ORACLE_TAKES", 1)
     patch.setattr(
-        control_policies, "config_of", lambda task: with_fields(config_of(task), loop_s=8.0)
+        control_policies, "config_of", lambda task: with_fields(config_of(task), loop_s=4.0)
     )
 
 

@@ -26,6 +26,27 @@ from tests.surrogate.effects.test_user_defined import EXAMPLE
 ROOT = Path(__file__).resolve().parents[2]
 
 EXPERIMENT = """
+name = "follow"
+scenario = "track_circle"
+repeats = 2
+together = 1
+
+[limits]
+time_s = 0.3
+
+[[phases]]
+name = "go"
+arm = "policy"
+timeout_s = 0.3
+on_timeout = "go on"
+
+[[cases]]
+name = "user"
+policy = "scripted"
+arm = "arm"
+"""
+
+IN_SCENE = """
 name = "short"
 scene = "scene"
 repeats = 2
@@ -72,7 +93,7 @@ COMMANDS = {
     "scene check": "scene check scene",
     "scene show": "scene show scene --save view.rrd",
     "experiment check": "experiment check short.toml",
-    "experiment run": "experiment run short.toml --processes 2 --no-replays -o results --force",
+    "experiment run": "experiment run follow.toml --processes 2 --no-replays -o results --force",
 }
 """What opens a model that holds the effect of the documentation, by command."""
 
@@ -82,7 +103,7 @@ NEXT = {"compare": 1, "amend": 1, "train": 1}
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory):
-    """A default arm with the documentation's effect, a recording, a scene and an experiment."""
+    """A default arm with the documentation's effect, a recording, a scene and experiments."""
     folder = tmp_path_factory.mktemp("lab")
     (folder / "slack.py").write_text(EXAMPLE)
     register_effect_file(folder / "slack.py")
@@ -102,7 +123,8 @@ def lab(tmp_path_factory):
     shutil.copytree(ROOT / "scenes" / "phantom_liver", folder / "scene")
     scene = (folder / "scene" / "scene.toml").read_text()
     (folder / "scene" / "scene.toml").write_text(scene.replace('"default"', '"../arm"'))
-    (folder / "short.toml").write_text(EXPERIMENT)
+    (folder / "short.toml").write_text(IN_SCENE)
+    (folder / "follow.toml").write_text(EXPERIMENT)
     return folder
 
 
@@ -170,7 +192,7 @@ def same_rows_in_one_process():
     both = sorted(Path("results", "rows").iterdir())
     assert len(both) == 2, "two episodes, each one a block of work"
     rows = [json.loads(path.read_text()) for path in both]
-    spec, alone = load_experiment("short.toml"), Path("alone")
+    spec, alone = load_experiment("follow.toml"), Path("alone")
     open_results(spec, alone)
     assert run_experiment(spec, alone) == rows
     assert rows[0] != rows[1]

@@ -269,8 +269,8 @@ class StaticError:
     """(F, F) covariance of the weights, in units of the static error's variance [-]."""
 
     @classmethod
-    def fitted(cls, runs: Sequence[Blocks], ridge: float) -> StaticError:
-        """The static error given runs; ridge: one of `RIDGES`."""
+    def fitted(cls, runs: Sequence[Blocks], ridges: Sequence[float]) -> list[StaticError]:
+        """The static error given runs, for each of some ridges (`RIDGES`)."""
         every = Blocks(*(np.concatenate(parts) for parts in zip(*runs, strict=True)))
         count = len(every.position)
         chosen = np.unique(np.linspace(0, count - 1, min(CENTRES, count)).round().astype(int))
@@ -279,15 +279,28 @@ class StaticError:
         kept = values > 1e-6 * values.max()
         root = vectors[:, kept] / np.sqrt(values[kept])
         features = kernel(every.position, every.direction, *centres) @ root
-        normal = features.T @ features / ridge + np.eye(features.shape[1])
-        spread = linalg.inv(normal)
+        square = features.T @ features
         mean = every.residual_mm.mean(axis=0)
-        weights = spread @ features.T @ (every.residual_mm - mean) / ridge
-        return cls(mean, centres, root, weights, spread)
+        found = []
+        for ridge in ridges:
+            spread = linalg.inv(square / ridge + np.eye(features.shape[1]))
+            weights = spread @ features.T @ (every.residual_mm - mean) / ridge
+            found.append(cls(mean, centres, root, weights, spread))
+        return found
 
-    def given(self, blocks: Blocks) -> tuple[np.ndarray, np.ndarray]:
-        """What it leaves of a residual, (J, d) [mm], and (J,) its own variance there [0..1]."""
-        features = kernel(blocks.position, blocks.direction, *self.centres) @ self.root
+    def features(self, blocks: Blocks) -> np.ndarray:
+        """(J, F) unit-normal features of blocks; those of every ridge are the same."""
+        return kernel(blocks.position, blocks.direction, *self.centres) @ self.root
+
+    def given(
+        self, blocks: Blocks, features: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What it leaves of a residual, (J, d) [mm], and (J,) its own variance there [0..1].
+
+        features: those of the blocks, where they are known.
+        """
+        if features is None:
+            features = self.features(blocks)
         left = blocks.residual_mm - self.mean_mm - features @ self.weights_mm
         away = np.maximum(1.0 - (features**2).sum(axis=1), 0.0)
         return left, away + ((features @ self.spread) * features).sum(axis=1)
@@ -531,7 +544,7 @@ def fit_detector(
             f"{LEAST_BLOCKS * design.block_s:g} s; record longer"
         )
     folds = [[run] for run in runs] if len(runs) >= FOLDS else _fifths(runs)
-    held = {ridge: _held_out(folds, ridge, design.block_s) for ridge in RIDGES}
+    held = _held_out(folds, design.block_s)
     ridge = min(RIDGES, key=lambda each: sum((part.left**2).sum() for part in held[each]))
     found, squares, counts = _whitened(held[ridge], design, elsewhere_mm2)
     enlargement = _enlargement(squares, counts, design)
@@ -542,7 +555,7 @@ def fit_detector(
     return Detector(
         design,
         half_range,
-        StaticError.fitted(runs, ridge),
+        StaticError.fitted(runs, (ridge,))[0],
         found,
         Coverage.of([run.position for run in runs], design.block_s),
         enlargement,
@@ -568,16 +581,19 @@ class _HeldOut(NamedTuple):
     """(J - 1,) whether the others cover the motion from the second block on."""
 
 
-def _held_out(folds: Sequence[Sequence[Blocks]], ridge: float, block_s: float) -> list[_HeldOut]:
-    """Every run of every fold, judged by the other folds."""
-    found = []
+def _held_out(folds: Sequence[Sequence[Blocks]], block_s: float) -> dict[float, list[_HeldOut]]:
+    """Every run of every fold, judged by the other folds, with each of `RIDGES`."""
+    found: dict[float, list[_HeldOut]] = {ridge: [] for ridge in RIDGES}
     for k, fold in enumerate(folds):
         others = [run for j, other in enumerate(folds) if j != k for run in other]
-        static = StaticError.fitted(others, ridge)
+        statics = StaticError.fitted(others, RIDGES)
         coverage = Coverage.of([run.position for run in others], block_s)
         for run in fold:
             covered = coverage.covers(motion(run.position))
-            found.append(_HeldOut(k, *static.given(run), run.path, covered))
+            features = statics[0].features(run)
+            for ridge, static in zip(RIDGES, statics, strict=True):
+                judged = static.given(run, features)
+                found[ridge].append(_HeldOut(k, *judged, run.path, covered))
     return found
 
 

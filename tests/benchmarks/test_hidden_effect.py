@@ -88,7 +88,7 @@ def test_a_changed_bench_is_the_rig_with_that_change(tmp_path):
 
 
 def brief(patch):
-    """Let a study look without cameras, in one recording, and in episodes of a quarter of the time."""
+    """Let a study look without cameras, in one recording, and in circles of a fifth of the time."""
     patch.setattr(hidden_effect_policies, "SIGHTS", ("blind",))
     patch.setattr(hidden_effect, "ORACLE_TAKES", 1)
     patch.setattr(

@@ -50,7 +50,7 @@ def lab(tmp_path_factory):
     save_model(default_arm(), folder / "arm")
     for name, roll_deg, hidden in (("bench", 0.0, [("creep", 1.0)]), ("turned", 90.0, [])):
         rig = VirtualRig(0, take=7, roll_deg=roll_deg, hidden=hidden)
-        recording = rig.record(make_protocol("mixed", rig.limits, 800, seed=2))[0]
+        recording = rig.record(make_protocol("mixed", rig.limits, 400, seed=2))[0]
         save_recording(recording, folder / f"{name}.parquet")
     return folder
 

@@ -73,24 +73,31 @@ def of_command(folder: Path, *arguments: str) -> dict:
     return timeless(json.loads(out.read_text()))
 
 
-def test_the_snippet_of_the_documentation_gives_what_the_command_prints(lab, monkeypatch, capsys):
+@pytest.fixture(scope="module")
+def diagnosed_by_command(lab):
+    """The JSON of `surgisoft diagnose` of the recording with creep."""
+    return of_command(lab, "diagnose", str(lab / "arm"), str(lab / "bench.parquet"))
+
+
+def test_the_snippet_of_the_documentation_gives_what_the_command_prints(
+    lab, diagnosed_by_command, monkeypatch, capsys
+):
     monkeypatch.chdir(lab)
     (snippet,) = (text for text in python_snippets("diagnosis.md") if "diagnose(" in text)
     names = {}
     exec(snippet, names)
     said = capsys.readouterr().out
-    assert as_written(names["found"]) == of_command(lab, "diagnose", "arm", "bench.parquet")
+    assert as_written(names["found"]) == diagnosed_by_command
     assert names["found"].verdict.sentence in said
 
 
-def test_training_residuals_decide_in_python_too(lab):
+def test_training_residuals_decide_in_python_too(lab, diagnosed_by_command):
     """A model without them is another question, and the ranking's numbers differ."""
     model = load_model(lab / "arm")
     assert model.training_residuals is not None
-    with_them = diagnose(model, lab / "bench.parquet")
     model.training_residuals = None
-    without = diagnose(model, lab / "bench.parquet")
-    assert with_them.to_json()["statistics"] != without.to_json()["statistics"]
+    without = as_written(diagnose(model, lab / "bench.parquet"))
+    assert diagnosed_by_command["statistics"] != without["statistics"]
 
 
 def test_a_turned_bench_gives_one_result_everywhere(lab, capsys):

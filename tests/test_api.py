@@ -93,9 +93,10 @@ def test_collect_and_fit_give_what_the_commands_write(tmp_path, monkeypatch):
     mine = surgisoft.collect("walk", seed=4, points=300, hidden=["creep:0.5"])
     theirs = surgisoft.load_recording("a.parquet")
     np.testing.assert_array_equal(mine.key_points_mm, theirs.key_points_mm)
-    fields = {"inputs": "pressure", "effects": ["hysteresis"], "epochs": 3, "hidden": (8, 8)}
+    fields = {"inputs": "pressure", "effects": ["hysteresis"], "epochs": 3, "prior": "none"}
+    fields["hidden"] = (8, 8)
     result = surgisoft.fit("a.parquet", **fields)
-    rest = "--inputs pressure --effects hysteresis --epochs 3 --widths 8,8"
+    rest = "--inputs pressure --effects hysteresis --epochs 3 --widths 8,8 --prior none"
     assert run(f"fit a.parquet -o arm {rest}".split()) == 0
     fitted = surgisoft.load("arm")
     for name, value in result.model.state_dict().items():
@@ -116,9 +117,10 @@ def test_a_user_defined_rig_is_recorded_by_the_same_function():
 
 def test_train_and_evaluate_give_what_the_commands_write(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    run_ = surgisoft.train("track_circle", "mine", steps=64, envs=8, seed=5)
+    (tmp_path / "short.toml").write_text("[follow]\nloop_s = 4.0\n")
+    run_ = surgisoft.train("track_circle", "mine", steps=64, envs=8, seed=5, config="short.toml")
     assert run_.result.done
-    again = "train --task track_circle -o theirs --steps 64 --envs 8 --seed 5"
+    again = "train --task track_circle -o theirs --steps 64 --envs 8 --seed 5 --config short.toml"
     assert run(again.split()) == 0
     found = surgisoft.evaluate(["mine", "theirs", "random"], episodes=2, seed=1)
     mine, theirs, random = found.to_json()["policies"].values()

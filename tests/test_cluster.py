@@ -102,7 +102,12 @@ def test_a_cluster_that_is_not_there_is_one_line(monkeypatch):
 def test_a_cluster_that_cannot_do_the_work_is_one_line(nodes, threads, words):
     with (
         distributed.LocalCluster(
-            n_workers=nodes, threads_per_worker=threads, dashboard_address=":0", host="127.0.0.1"
+            n_workers=nodes,
+            threads_per_worker=threads,
+            processes=False,
+            protocol="tcp://",
+            dashboard_address=":0",
+            host="127.0.0.1",
         ) as made,
         pytest.raises(InputError, match=words),
         workers(1, cluster=made.scheduler_address),

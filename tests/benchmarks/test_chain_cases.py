@@ -194,7 +194,7 @@ def test_the_generator_has_every_known_effect_and_no_name_for_the_others():
 def test_every_effect_changes_the_motion_and_nothing_else_does():
     """Without any the motion is equal to the last bit."""
     rig = ChainRig(600, noise=0.0)
-    protocol = rig_cases.excitation(rig, "tried", ("steps", "wander"), 140.0, 600)
+    protocol = rig_cases.excitation(rig, "tried", ("steps", "wander"), 100.0, 600)
     plain = rig.record(protocol)[1].noise_free_mm
     again = ChainRig(600, noise=0.0).record(protocol)[1].noise_free_mm
     np.testing.assert_array_equal(again, plain)

@@ -375,7 +375,7 @@ def test_bad_folders_of_cases_are_one_line(bench, tmp_path, capsys):
 
 def test_a_case_is_judged_by_its_robots_model(bench, tmp_path, monkeypatch):
     written_cases(bench, tmp_path)
-    quick = FitOptions(inputs="pressure", widths=(16, 16), epochs=60)
+    quick = FitOptions(inputs="pressure", widths=(16, 16), epochs=20, prior="none")
     model = fitted(bench.before, quick, "measured", Cache(tmp_path / "fits"), silent)
     robot = tmp_path / "robots" / "trunk"
     save_model(model, robot / "model", {})

@@ -51,7 +51,7 @@ states = ["a.parquet"]
 def bench(tmp_path_factory):
     """Half a minute of the virtual rig, its context, and the report of the package's arm on it."""
     folder = tmp_path_factory.mktemp("bench")
-    collect = ["collect", "mixed", "--points", "500", "--seed", "0"]
+    collect = ["collect", "mixed", "--points", "300", "--seed", "0"]
     assert run([*collect, "-o", str(folder / "a.parquet")]) == 0
     (folder / "context.toml").write_text(CONTEXT)
     command = ["compare", "default", str(folder / "a.parquet"), "--report", str(folder / "report")]

@@ -18,15 +18,15 @@ from surgisoft.measurement.recordings import load_recording
 def lab(tmp_path_factory):
     """A small collection and a model fitted to it."""
     folder = tmp_path_factory.mktemp("lab")
-    for protocol, points in (("walk", "600"), ("validation", "150"), ("test", "150")):
+    for protocol, points in (("walk", "1000"), ("validation", "150"), ("test", "150")):
         out = str(folder / f"{protocol}.parquet")
         assert run(["collect", protocol, "--points", points, "--seed", "4", "-o", out]) == 0
     assert (
         run(
             [
                 "fit", str(folder / "walk.parquet"), "--valid", str(folder / "validation.parquet"),
-                "--effects", "hysteresis", "--epochs", "60", "--widths", "48,48",
-                "-o", str(folder / "arm"),
+                "--effects", "hysteresis", "--prior", "none", "--epochs", "50",
+                "--widths", "48,48", "-o", str(folder / "arm"),
             ]
         )
         == 0
@@ -40,7 +40,8 @@ def test_fitted_arm_beats_pressure_alone(lab, capsys):
         run(
             [
                 "fit", str(lab / "walk.parquet"), "--valid", str(lab / "validation.parquet"),
-                "--inputs", "pressure", "--epochs", "60", "--widths", "48,48", "-o", plain,
+                "--inputs", "pressure", "--prior", "none", "--epochs", "50",
+                "--widths", "48,48", "-o", plain,
             ]
         )
         == 0

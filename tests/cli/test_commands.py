@@ -297,8 +297,14 @@ def test_files_are_written_before_the_output_is_printed(lab, tmp_path, monkeypat
     assert all(path.exists() for path in files)
 
 
-def test_several_models_on_the_same_recording(lab, tmp_path, capsys):
-    """The table, the page and the numbers hold each of them; models stand before recordings."""
+def test_several_models_on_the_same_recording(lab, tmp_path, monkeypatch, capsys):
+    """The table, the page and the numbers hold each of them; models stand before recordings.
+
+    The pages of single models are without their charts here: tests/diagnosis/test_compare.py has them.
+    """
+    pages = "surgisoft.diagnosis.pages.compare"
+    for drawing in ("draw_all", "axis_charts"):
+        monkeypatch.setattr(f"{pages}.{drawing}", lambda *_: [])
     arm, test, file = str(lab / "arm"), str(lab / "test.parquet"), tmp_path / "c.json"
     options = ["--json", str(file), "--report", str(tmp_path / "page")]
     assert run(["compare", arm, "default", test, *options]) == 0

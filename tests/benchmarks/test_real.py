@@ -29,13 +29,13 @@ files = ["after.parquet"]
 [fit]
 inputs = "pressure"
 widths = [16, 16]
-epochs = 30
+epochs = 80
 prior = "none"
 """
 NOISE_MM = 0.02
 
 
-def made_up(gain: float, seed: int, rows: int = 600) -> Recording:
+def made_up(gain: float, seed: int, rows: int = 1200) -> Recording:
     """A planar arm of two chambers, whose second one has a gain."""
     rng = np.random.default_rng(seed)
     time = 0.05 * np.arange(rows)

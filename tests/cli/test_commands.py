@@ -300,7 +300,8 @@ def test_files_are_written_before_the_output_is_printed(lab, tmp_path, monkeypat
 def test_several_models_on_the_same_recording(lab, tmp_path, monkeypatch, capsys):
     """The table, the page and the numbers hold each of them; models stand before recordings.
 
-    The pages of single models are without their charts here: tests/diagnosis/test_compare.py has them.
+    The pages of single models are without their charts here, which tests/diagnosis/test_compare.py
+    has.
     """
     pages = "surgisoft.diagnosis.pages.compare"
     for drawing in ("draw_all", "axis_charts"):

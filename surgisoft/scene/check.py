@@ -333,20 +333,18 @@ def _view(
     scenes: list[dict[str, ArmShape]],
     scene: Scene,
 ) -> np.ndarray:
-    """Fraction of ring points in view of an endoscope at every VIEW_EVERYth moment."""
-    camera, ring = scene.spec.camera.camera(), scene.ring
-    looks = (
-        view(
-            checker,
-            camera,
-            look.pose,
-            ring.points_mm,
-            ring.normals,
-            {other: shape for other, shape in shapes.items() if other != name},
-        )
-        for shapes in scenes[::VIEW_EVERY]
-    )
-    return np.array([one.fraction for one in looks])
+    """Fraction of ring points in view of an endoscope at every VIEW_EVERYth moment.
+
+    The endoscope stands still: what the bodies hide from it is found once.
+    """
+    given = scene.spec.camera.camera(), look.pose, scene.ring.points_mm, scene.ring.normals
+    among_bodies, arms_alone = view(checker, *given).visible, CollisionChecker([])
+    fractions = []
+    for shapes in scenes[::VIEW_EVERY]:
+        others = {other: shape for other, shape in shapes.items() if other != name}
+        visible = among_bodies & view(arms_alone, *given, others).visible
+        fractions.append(visible.mean())
+    return np.array(fractions)
 
 
 def _ways(checker: CollisionChecker, arms: dict[str, MountedArm], work: Work):

@@ -424,39 +424,48 @@ class CollisionChecker:
         """
         origins = np.asarray(origins_mm, dtype=np.float64)
         directions = frames.normalise(np.asarray(directions, dtype=np.float64))
-        shape = origins.shape[:-1]
-        columns = [np.empty(shape + tail, kind) for kind, tail in _HIT_COLUMNS]
-        for index in np.ndindex(shape):
-            hit = self._cast_one(origins[index], directions[index], range_mm, arms or {}, own)
+        batch = origins.shape[:-1]
+        columns = [np.empty(batch + tail, kind) for kind, tail in _HIT_COLUMNS]
+        met = [
+            _arm_met(origins, directions, shape, name == own)
+            for name, shape in (arms or {}).items()
+        ]
+        rays = origins.reshape(-1, 3), directions.reshape(-1, 3)
+        enters = [
+            _enter_box(
+                frames.apply(inward, rays[0]),
+                frames.rotate(inward, rays[1]),
+                range_mm,
+                body.mesh.bounds_mm,
+            ).reshape(batch)
+            for inward, body in zip(self._inward, self.bodies, strict=True)
+        ]
+        for index in np.ndindex(batch):
+            among = [number for number, enter in enumerate(enters) if enter[index]]
+            hit = self._cast_one(origins[index], directions[index], range_mm, met, among, index)
             for column, value in zip(columns, hit, strict=True):
                 column[index] = value
         return RayHit(*columns)
 
-    def _cast_one(self, origin, direction, range_mm, arms, own, among=None) -> tuple:
-        """Fields of the `RayHit` of one ray; among: numbers of the bodies to ask FCL about."""
+    def _cast_one(self, origin, direction, range_mm, met, among, index=()) -> tuple:
+        """Fields of the `RayHit` of one ray.
+
+        met: of each arm what `_arm_met` found for all rays, of which this is number `index`; among:
+        numbers of the bodies to ask FCL about.
+        """
         best = (Struck.NOTHING, -1, -1, range_mm, origin + range_mm * direction, -direction)
-        probe = _probe(origin, direction, range_mm)
-        for index, body in enumerate(self.bodies):
-            if among is not None and index not in among:
-                continue
-            inward = self._inward[index]
-            o, d = frames.apply(inward, origin[None]), frames.rotate(inward, direction[None])
-            if not _enter_box(o, d, best[3], body.mesh.bounds_mm)[0]:
-                continue
-            face, t = self._first_face(index, probe, origin, direction, best[3])
+        probe = _probe(origin, direction, range_mm) if among else None
+        for number in among:
+            body = self.bodies[number]
+            face, t = self._first_face(number, probe, origin, direction, best[3])
             if face >= 0:
                 normal = body.pose[:3, :3] @ body.mesh.face_normals[face]
-                best = (struck_of(body), index, face, t, origin + t * direction, normal)
-        for name, shape in arms.items():
-            free, kind = None, Struck.OTHER_ARM
-            if name == own:
-                free = ray_free_segments(shape.centreline_mm, shape.radius_mm)
-                kind = Struck.OWN_ARM
-            line = shape.centreline_mm
-            t, segment = ray_chain(origin, direction, line, shape.radius_mm, free)
+                best = (struck_of(body), number, face, t, origin + t * direction, normal)
+        for kind, line, distance, segment in met:
+            t = distance[index]
             if t < best[3]:
                 point = origin + t * direction
-                best = (kind, -1, -1, t, point, chain_normal(point, line, segment))
+                best = (kind, -1, -1, t, point, chain_normal(point, line, segment[index]))
         cosine = abs(frames.dot(best[5], direction))
         sine = frames.norm(frames.cross(best[5], direction))
         return (*best, float(np.arctan2(sine, cosine)))
@@ -476,6 +485,17 @@ class CollisionChecker:
         return (
             (int(faces[nearest]), float(t[nearest])) if t[nearest] <= range_mm else (-1, range_mm)
         )
+
+
+def _arm_met(origins, directions, shape: ArmShape, own: bool) -> tuple:
+    """Where rays (..., 3) meet an arm: what it is to them, its centreline, distance and segment.
+
+    own: whether the arm carries the beams.
+    """
+    line = shape.centreline_mm
+    free = ray_free_segments(line, shape.radius_mm) if own else None
+    t, segment = ray_chain(origins, directions, line, shape.radius_mm, free)
+    return Struck.OWN_ARM if own else Struck.OTHER_ARM, line, t, segment
 
 
 def _probe(origin, direction, range_mm: float) -> fcl.CollisionObject:
@@ -738,12 +758,12 @@ class GuidedChecker:
             for index, tree in enumerate(self._trees)
             if beam_near_surface(*ray, *self._frames[index], BEAM_SLACK_MM, tree, *self._work)
         ]
-        near = {}
+        near = []
         for name, shape in arms.items():
             gap = self_contact_gap_mm(shape.radius_mm) if name == own else -1.0
             if beam_near_chain(*ray, shape.centreline_mm, shape.radius_mm, gap, BEAM_SLACK_MM):
-                near[name] = shape
-        return self.checker._cast_one(*ray, near, own, bodies)
+                near.append(_arm_met(origin_mm, direction, shape, name == own))
+        return self.checker._cast_one(*ray, near, bodies)
 
     def cast_all(
         self,

@@ -4,8 +4,9 @@ This module is geometry only. The table is sampled from any arm model over a gri
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from itertools import product
+from operator import mul
 
 import numpy as np
 
@@ -83,17 +84,20 @@ class ArmReach:
 
     def _blend(self, table: np.ndarray, commands: np.ndarray) -> np.ndarray:
         """Multilinear interpolation of table rows at commands (M, P), clipped to the grid."""
-        low, part = [], []
-        for axis, value in zip(self.axes, commands.T, strict=True):
-            cell = np.clip(np.searchsorted(axis, value, side="right") - 1, 0, len(axis) - 2)
-            low.append(cell)
-            part.append(np.clip((value - axis[cell]) / (axis[cell + 1] - axis[cell]), 0.0, 1.0))
         shape = tuple(len(axis) for axis in self.axes)
+        first, shares = np.zeros(len(commands), np.int64), []
+        for axis, value in zip(self.axes, commands.T, strict=True):
+            cell = np.searchsorted(axis, value, side="right") - 1
+            cell = np.minimum(np.maximum(cell, 0), len(axis) - 2)
+            part = (value - axis[cell]) / (axis[cell + 1] - axis[cell])
+            part = np.minimum(np.maximum(part, 0.0), 1.0)
+            first = first * len(axis) + cell
+            shares.append((1.0 - part, part))
         result = np.zeros((len(commands), table.shape[1]))
         for corner in product((0, 1), repeat=len(self.axes)):
-            weight = np.prod([p if c else 1.0 - p for p, c in zip(part, corner, strict=True)], 0)
-            row = np.ravel_multi_index([i + c for i, c in zip(low, corner, strict=True)], shape)
-            result += weight[:, None] * table[row]
+            weight = reduce(mul, (share[c] for share, c in zip(shares, corner, strict=True)))
+            rows = table.take(first + np.ravel_multi_index(corner, shape), axis=0)
+            result += weight[:, None] * rows
         return result
 
     def tips(self, commands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,6 +1,7 @@
 """The phantom liver: a liver's size, sound meshes, made by its own script, ready for every task."""
 
 import importlib.util
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,10 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from surgisoft.scene.bvh import build_tree
-from surgisoft.scene.check import check_scene
+from surgisoft.scene.camera import view
+from surgisoft.scene.capsules import ArmShape
+from surgisoft.scene.check import VIEW_EVERY, check_scene
+from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.folder import open_scene
 from surgisoft.tasks.world.reach import reaches_of
 
@@ -99,3 +103,27 @@ def test_the_scene_is_ready(scene):
     assert verdict.work.viewed == 1.0
     assert scene.spec.lesion.diameter_mm == 20.0
     assert [(m.length_mm, m.diameter_mm) for m in scene.spec.mounts] == [(70.0, 15.0)] * 2
+
+
+@pytest.mark.parametrize(
+    ("place", "hides"), [((-73.0, -79.0, 185.0), "laser"), ((-108.0, 38.0, 86.0), "organ")]
+)
+def test_the_check_sees_the_ring_between_all_arms_and_bodies(scene, place, hides):
+    """An endoscope behind the laser, and one behind the organ: the view of each moment alone."""
+    spec, ring = scene.spec, scene.ring
+    laser, endoscope = spec.mount("laser"), spec.mount("endoscope")
+    way = np.array(spec.lesion.centre_mm) - place if hides == "organ" else laser.direction
+    moved = replace(endoscope, position_mm=place, direction=tuple(way))
+    scene = replace(scene, spec=replace(spec, mounts=(laser, moved)))
+    reaches = reaches_of(scene)
+    work = check_scene(scene, reaches).work
+    checker, given = CollisionChecker(scene.bodies), (ring.points_mm, ring.normals)
+    found, pose = work.views["endoscope"], work.looks["endoscope"].pose
+    free = view(checker, spec.camera.camera(), pose, *given)
+    assert free.hidden.any() == (hides == "organ")
+    assert (found < free.fraction).any() == (hides == "laser")
+    lines = work.cuts["laser"].lines_mm[:: 3 * VIEW_EVERY]
+    for fraction, line in zip(found[::3], lines, strict=True):
+        arms = {"laser": ArmShape(line, reaches["laser"].radius_mm)}
+        seen = view(checker, spec.camera.camera(), pose, *given, arms)
+        assert fraction == seen.fraction

@@ -56,6 +56,15 @@ def new(folder, *arguments):
     return run(["scene", "new", *map(str, arguments), "-o", str(folder)])
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_mounts():
+    """Of each arm a quarter of the mounts are tried: tests/scene/test_arms.py tries them all."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mounts, "MOST_EVALUATED", 60)
+        patch.setattr(mounts, "TRIES", 15)
+        yield
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A lumpy organ in metres, inside out, as an STL, with a keep-out rod beside it."""

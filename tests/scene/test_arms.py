@@ -18,7 +18,7 @@ from surgisoft.scene.folder import open_scene
 from surgisoft.scene.meshio import write_ply
 from surgisoft.scene.spec import SCENES, MountSpec, arm_names, save_spec
 from surgisoft.tasks.world.random_streams import streams
-from surgisoft.tasks.world.reach import blank_mounts, reaches_of
+from surgisoft.tasks.world.reach import blank_mounts
 from surgisoft.tasks.world.world import WorldConfig, scene_world
 from tests.scene.shapes import ball, box
 
@@ -177,7 +177,17 @@ def test_a_scene_is_made_for_two_lasers_an_endoscope_and_a_tip(tmp_path, capsys)
     assert run(["scene", "new", str(tmp_path / "ball.ply"), "-o", str(tmp_path / "s"), *given]) == 0
     made = open_scene(tmp_path / "s")
     assert list(made.spec.arms) == ["laser_1", "laser_2", "endoscope", "tip"]
-    verdict = check_scene(made, reaches_of(made))
+    verdicts, picture = [], tmp_path / "map.png"
+    with pytest.MonkeyPatch.context() as patch:  # the command's own verdict
+
+        def kept(*given):
+            verdicts.append(check_scene(*given))
+            return verdicts[-1]
+
+        patch.setattr("surgisoft.scene.check.check_scene", kept)
+        assert run(["scene", "check", str(tmp_path / "s"), "--map", str(picture)]) == 0
+    assert picture.stat().st_size > 10_000
+    (verdict,) = verdicts
     assert verdict.good
     assert verdict.work.covered == 1.0
     what = [finding.what for finding in verdict.findings]
@@ -199,8 +209,5 @@ def test_a_scene_is_made_for_two_lasers_an_endoscope_and_a_tip(tmp_path, capsys)
     assert worst >= made.spec.limits.clearance_mm
     touch = verdict.work.touches["tip"].way_mm[-1, -1]
     assert np.linalg.norm(touch) == pytest.approx(60.0 + 7.5 + 1.5, abs=0.6)
-    picture = tmp_path / "map.png"
-    assert run(["scene", "check", str(tmp_path / "s"), "--map", str(picture)]) == 0
-    assert picture.stat().st_size > 10_000
     capsys.readouterr()
     assert run(["scene", "show", str(tmp_path / "s"), "--save", str(tmp_path / "s.rrd")]) == 0

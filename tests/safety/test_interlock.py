@@ -35,9 +35,9 @@ class Attack:
 
     clearance_mm: float = TIGHT_MM
     """Limit of the clearance, which the expert just keeps, mm."""
-    warm: int = 42
+    warm: int = 24
     """Steps in which all arms follow the expert at first."""
-    steps: int = 20
+    steps: int = 8
     """Steps under adversaries."""
     seed: int = 1
     """Seed of episodes and adversaries."""
@@ -47,8 +47,9 @@ class Attack:
 
 ATTACKS = {
     "contour_ablation": Attack(clearance_mm=27.0),
-    "keyhole_ablation": Attack(1.5, 55, 30, fields={"speed_mm_s": 80.0, "wait_s": 0.5}),
-    "two_laser_ring": Attack(clearance_mm=15.0),
+    "area_ablation": Attack(clearance_mm=25.5, seed=3),
+    "keyhole_ablation": Attack(1.5, 42, fields={"speed_mm_s": 80.0, "wait_s": 0.5}),
+    "two_laser_ring": Attack(15.0, 14),
 }
 """Around contours the expert keeps more than 24 mm. Arms that enter through ports are fed in
 quickly, and are never 24 mm from the wall; two lasers and an endoscope around one ring are nearer
@@ -56,12 +57,12 @@ to each other than one laser and an endoscope."""
 
 
 ON_RIG = {
-    "circle_ablation": Attack(25.5, seed=3),
-    "contour_ablation": Attack(25.5),
-    "area_ablation": Attack(25.5),
-    "breathing_ablation": Attack(25.0, seed=3),
-    "keyhole_ablation": replace(ATTACKS["keyhole_ablation"], clearance_mm=1.2, steps=45, seed=3),
-    "two_laser_ring": replace(ATTACKS["two_laser_ring"], seed=3),
+    "circle_ablation": Attack(25.5, steps=12, seed=3),
+    "contour_ablation": Attack(25.5, steps=12, seed=3),
+    "area_ablation": Attack(25.5, steps=12, seed=3),
+    "breathing_ablation": Attack(25.0, steps=16, seed=2),
+    "keyhole_ablation": replace(ATTACKS["keyhole_ablation"], clearance_mm=1.2, steps=16, seed=3),
+    "two_laser_ring": Attack(16.0, 14, 16, seed=3),
 }
 """The same on virtual rigs: limits and seeds with which two episodes have steps in which the
 clearance alone keeps the beam off, and others in which sight alone does."""
@@ -75,9 +76,9 @@ def attacked(name, attacks=ATTACKS):
 
 @pytest.mark.parametrize("name", laser_tasks())
 def test_no_policy_turns_the_beam_on_where_it_must_be_off(name):
-    """Eight episodes of every task with a laser in simulation."""
+    """Twenty episodes of every task with a laser in simulation."""
     task, how = attacked(name)
-    found = attack(task, 8, how.warm + how.steps, seed=how.seed, warm=how.warm)
+    found = attack(task, 20, how.warm + how.steps, seed=how.seed, warm=how.warm)
     assert found.broken == []
     assert found.fired > 10, "the beam has to be on at times, or nothing is tested"
     for reason in ("too close", "off the path"):
@@ -110,7 +111,7 @@ def phased(tmp_path_factory):
 def test_an_experiments_limit_holds_in_all_its_phases(phased):
     task, base, spec = phased
     audit = Audit(base, clearance_mm=spec.limits.clearance_mm)
-    found = attack(task, 8, 62, seed=1, warm=42, audit=audit, base=base)
+    found = attack(task, 20, 32, seed=1, warm=24, audit=audit, base=base)
     assert found.broken == []
     assert found.fired > 10
     assert found.unsafe["too close"] > 5

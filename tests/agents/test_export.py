@@ -56,9 +56,9 @@ SHORT = {
     "two_laser_ring": {},
 }
 """Fields that make an episode of a task short, but not below 25 steps, and its feed begin in it."""
-DECISIONS = 12
+DECISIONS = 6
 """Decisions of the controller of every task. An observer gain of 0.9 then moves true key points by
-0.01 mm (`circle_ablation`) and 0.03 mm (`track_circle`), as it does in 25 decisions."""
+0.006 mm (`circle_ablation`) and 0.014 mm (`track_circle`), 60 times what is accepted and more."""
 AGREE_MM = 1e-4
 """Tolerance of a true key point."""
 AGREE_KPA = 1e-4

@@ -172,8 +172,27 @@ def _quiet():
     before = logging.root.manager.disable
     logging.disable(logging.ERROR)
     try:
-        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+        with (
+            warnings.catch_warnings(),
+            contextlib.redirect_stdout(io.StringIO()),
+            without_stacks(),
+        ):
             warnings.simplefilter("ignore")
             yield
     finally:
         logging.disable(before)
+
+
+@contextlib.contextmanager
+def without_stacks():
+    """Traces of modules do not keep the call stack of each operation, which nobody reads."""
+    name = "do_not_emit_stack_traces"
+    if not hasattr(torch.fx.config, name):  # torch 2.10 and before
+        yield
+        return
+    before = getattr(torch.fx.config, name)
+    setattr(torch.fx.config, name, True)
+    try:
+        yield
+    finally:
+        setattr(torch.fx.config, name, before)

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from surgisoft.graphs import DoesNotTrace, reason_of
+from surgisoft.graphs import DoesNotTrace, reason_of, without_stacks
 
 WRITTEN = 24
 """Most numbers of a constant that are written as such; more are written as base64."""
@@ -190,7 +190,7 @@ def numpy_function(
         batch = torch.export.Dim("batch", min=1)
         shapes = tuple({0: batch} for _ in example)
     try:
-        with warnings.catch_warnings(), torch.no_grad():
+        with warnings.catch_warnings(), without_stacks(), torch.no_grad():
             warnings.simplefilter("ignore")
             # Copies: one tensor given twice would become one input.
             given = tuple(value.clone() for value in example)

@@ -65,6 +65,10 @@ def bench(tmp_path_factory):
     return folder / "bench.csv", recording
 
 
+def _tuple_of(found):
+    return found if isinstance(found, tuple) else (found,)
+
+
 def exact(recording):
     """The history of a recording in double precision."""
     history = history_of([recording])
@@ -109,8 +113,17 @@ def test_every_effect_of_the_library_is_exported(exported, bench):
     assert worst < 1e-5
 
 
-def test_files_are_compared_over_whole_recordings(bench, tmp_path, capsys):
-    """Two runs of different length, without the padding; steps of another arm would be noticed."""
+def test_files_are_compared_over_whole_recordings(bench, tmp_path, capsys, monkeypatch):
+    """Two runs of different length, without the padding; steps of another arm would be noticed.
+
+    TorchScript alone: the other file answers as its module does.
+    """
+
+    def written(module, example, file, *names, **options):
+        file.write_bytes(b"")
+        return lambda *given: _tuple_of(module(*given))
+
+    monkeypatch.setattr(exporting, "write_onnx", written)
     recording = bench[1]
     run_of_row = (np.arange(recording.samples) >= 50).astype(recording.run.dtype)
     save_recording(replace(recording, run=run_of_row), tmp_path / "two.csv")

@@ -123,8 +123,8 @@ def predicted(recording, folder, *arguments):
     ("name", "effects"),
     [
         ("static", tuple(EFFECTS)),
-        ("stepped", ("hysteresis", "creep", "payload")),
-        ("runs", ("hysteresis", "line_lag", "inertia", "contact")),
+        ("stepped", ("hysteresis", "creep")),
+        ("runs", ("hysteresis", "inertia")),
     ],
 )
 def test_the_file_predicts_a_recording_as_the_model_does(name, effects, bench):  # noqa: F811

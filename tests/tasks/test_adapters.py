@@ -39,7 +39,7 @@ def exact(name, geometry="fcl"):
 def test_pettingzoo_api(name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        parallel_api_test(SurgicalEnv(exact(name)), num_cycles=20)
+        parallel_api_test(SurgicalEnv(exact(name)), num_cycles=8)
 
 
 @every_task
@@ -55,7 +55,7 @@ def test_pettingzoo_runs_alike_for_many_steps(name):
         rng, heard = np.random.default_rng(0), []
         for seed in (7, None):
             env.reset(seed=seed)
-            for _ in range(15):
+            for _ in range(6):
                 shapes = {agent: env.action_space(agent).shape for agent in env.agents}
                 actions = {a: rng.uniform(-3, 3, s).astype("f4") for a, s in shapes.items()}
                 seen, rewards, *_, infos = env.step(actions)
@@ -157,7 +157,7 @@ def test_the_batched_environments_are_the_single_ones(name):
     for i, env in enumerate(singles):
         np.testing.assert_allclose(env.reset(seed=20 + i)[0], seen[i], atol=1e-4)
     rng = np.random.default_rng(1)
-    for _ in range(25):
+    for _ in range(10):
         actions = rng.uniform(-3, 3, (3, 3)).astype(np.float32)
         seen, rewards, *_ = many.step(actions)
         for i, env in enumerate(singles):

@@ -72,7 +72,7 @@ def test_a_batch_of_n_is_n_batches_of_one(name):
     episodes = Episodes(task_of(name))
     together = episodes.seeded(3, 3)
     alone = [episodes.seeded(3, 1, first=i) for i in range(3)]
-    for step in range(10):
+    for step in range(5):
         actions = random_actions(episodes.task, 3, step)
         together, outcome = episodes.step(together, actions)
         seen = episodes.observe(together)
@@ -91,7 +91,7 @@ def test_a_batch_of_n_is_n_batches_of_one(name):
 @every_task
 def test_the_same_seed_gives_the_same_episode_to_the_last_step(name):
     episodes = Episodes(task_of(name))
-    steps = 30
+    steps = 15
     (_, total, seen), (_, again, seen_again) = (played(episodes, 3, steps, seed=8) for _ in "ab")
     assert torch.equal(total, again)
     for one, other in zip(seen, seen_again, strict=True):
@@ -114,7 +114,7 @@ def test_time_is_out_at_the_end_and_not_before(name):
     task = copy.copy(task_of(name))
     if task.world.scene is not None:  # a whole episode takes seconds there
         assert task.steps > 200
-        task.steps = 60
+        task.steps = 20
     episodes = Episodes(task)
     state = episodes.seeded(0, 2)
     still = {a: torch.zeros(2, episodes.task.world.arms[a].chambers) for a in episodes.task.agents}
@@ -127,13 +127,13 @@ def test_time_is_out_at_the_end_and_not_before(name):
 @every_task
 def test_reset_begins_anew_only_where_asked(name):
     episodes = Episodes(task_of(name))
-    state, _, _ = played(episodes, 3, 20)
+    state, _, _ = played(episodes, 3, 8)
     before = tree_map(torch.clone, state)
     after = episodes.reset(state, torch.tensor([False, True, False]))
     kept = torch.tensor([0, 2])
     for agent, seen in episodes.observe(after).items():
         assert torch.equal(seen[kept], episodes.observe(before)[agent][kept])
-    assert after.world.steps.tolist() == [20, 0, 20]
+    assert after.world.steps.tolist() == [8, 0, 8]
     twice = episodes.reset(after, torch.tensor([False, True, False]))
     assert not torch.equal(
         twice.world.arms[episodes.task.agents[0]].pressure[1],

@@ -31,13 +31,24 @@ from surgisoft.tasks.registry import spec_of
 from tests.experiments.tiny import TINY, write
 from tests.report.browser import chromium, look
 
+PLAYED: dict = {}
+"""Blocks of `whole` by setting and first episode, for tests of what is done with them."""
+
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """An experiment through the command, in one go."""
     folder = tmp_path_factory.mktemp("whole")
     file, results = write(folder), folder / "results"
-    assert run(["experiment", "run", str(file), "-o", str(results), "--no-replays"]) == 0
+    play = experiment_run.roll_out_block
+
+    def kept(spec, setting, first, *given):
+        PLAYED[setting.label, first] = play(spec, setting, first, *given)
+        return PLAYED[setting.label, first]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(experiment_run, "roll_out_block", kept)
+        assert run(["experiment", "run", str(file), "-o", str(results), "--no-replays"]) == 0
     return file, results
 
 
@@ -46,12 +57,12 @@ def _rows(folder):
 
 
 def test_a_warning_of_several_blocks_is_given_once(whole, tmp_path, monkeypatch):
-    spec, found, play = load_experiment(whole[0]), [], experiment_run.roll_out_block
+    spec, found = load_experiment(whole[0]), []
 
-    def warned(*given):
+    def warned(spec, setting, first, *given):
         warnings.warn("a model of another robot", stacklevel=1)
         warnings.warn("overflow", RuntimeWarning, stacklevel=1)
-        return play(*given)
+        return PLAYED[setting.label, first]
 
     monkeypatch.setattr(experiment_run, "roll_out_block", warned)
     open_results(spec, tmp_path / "r")

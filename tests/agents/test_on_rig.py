@@ -80,7 +80,7 @@ def test_policies_see_measurements_and_errors_are_those_of_the_true_body(task):
 
 
 def test_memory_is_constant_over_episodes():
-    """200 episodes two by two: no rig of an earlier batch lives on, none of a reset episode."""
+    """50 episodes two by two: no rig of an earlier batch lives on, none of a reset episode."""
     alive, most = weakref.WeakSet(), 0
 
     def counted(config, trial):
@@ -92,10 +92,10 @@ def test_memory_is_constant_over_episodes():
 
     brief = track_circle(TrackConfig(FollowConfig(loop_s=0.1, approach_s=0.1)))
     moved = on_rig(brief, RigConfig(settle_s=0.05), counted)
-    rollout(moved, Random(), 160, seed=0, batch=2)
+    rollout(moved, Random(), 40, seed=0, batch=2)
     play = Episodes(moved)
     state = play.seeded(1, 2)
-    for _ in range(40):
+    for _ in range(10):
         state = play.reset(state, torch.tensor([True, False]))
     kept = state.world.arms["arm"].plant.rigs.items
     gc.collect()

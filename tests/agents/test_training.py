@@ -292,7 +292,7 @@ def test_it_learns(tmp_path):
         evaluate_every=1000,
         evaluation_episodes=8,
     )
-    plan = Plan("track_circle", config_of("track_circle"), "fast", preset, steps=40_000)
+    plan = Plan("track_circle", config_of("track_circle"), "fast", preset, steps=20_000)
     run = trained(tmp_path / "learns", plan)
     learned = run.load(BEST)["evaluation"]["error_mm"]
     random = evaluate_checkpoint(run.task(), Random(), 8)[0]["error_mm"]

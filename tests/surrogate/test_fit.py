@@ -41,14 +41,14 @@ def spread(judged) -> float:
 @pytest.fixture(scope="module")
 def walks():
     rng = np.random.default_rng(1)
-    return [history([walk(n, rng) for _ in range(4)], noise=NOISE, seed=n) for n in (700, 150, 160)]
+    return [history([walk(n, rng) for _ in range(4)], noise=NOISE, seed=n) for n in (400, 150, 160)]
 
 
 def test_memory_beats_direction_beats_pressure(walks):
     train, valid, test = walks
-    full = fit(train, valid, SPEC, replace(QUICK, epochs=90, effects=("hysteresis",)))
-    direction = fit(train, valid, SPEC, QUICK)
-    plain = fit(train, valid, SPEC, replace(QUICK, inputs="pressure"))
+    full = fit(train, valid, SPEC, replace(QUICK, epochs=40, effects=("hysteresis",)))
+    direction = fit(train, valid, SPEC, replace(QUICK, epochs=20))
+    plain = fit(train, valid, SPEC, replace(QUICK, epochs=20, inputs="pressure"))
     assert list(full.model.effects) == ["hysteresis"]
     errors = [rmse(result.model, test) for result in (full, direction, plain)]
     assert errors[0] < 0.6 * errors[1]
@@ -63,8 +63,8 @@ def test_memory_beats_direction_beats_pressure(walks):
 def test_nothing_is_added_where_there_is_no_hysteresis():
     """On an arm without memory neither direction nor plays earn a place."""
     rng = np.random.default_rng(2)
-    train, valid = (history([walk(400, rng)] * 4, hysteresis=0.0, seed=s) for s in (1, 2))
-    config = replace(QUICK, effects=("hysteresis",))
+    train, valid = (history([walk(250, rng)] * 4, hysteresis=0.0, seed=s) for s in (1, 2))
+    config = replace(QUICK, epochs=30, effects=("hysteresis",))
     result = fit(train, valid, SPEC, config)
     assert not result.model.effects
     assert not result.model.network.directions
@@ -74,14 +74,14 @@ def test_nothing_is_added_where_there_is_no_hysteresis():
 def test_a_plain_traverse_supports_neither_direction_nor_memory():
     """The trap: direction and memory are confounded with position; the simpler model is kept."""
     rng = np.random.default_rng(3)
-    train, test = history([traverse(11)]), history([walk(400, rng)], seed=4)
-    config = FitConfig(hidden=(64, 64), epochs=30, effects=("hysteresis",))
+    train, test = history([traverse(8)]), history([walk(400, rng)], seed=4)
+    config = replace(QUICK, epochs=20, effects=("hysteresis",))
     guarded = fit(train, None, SPEC, config)
     assert not guarded.model.effects
     assert not guarded.model.network.directions
     assert any("chamber 1: it reversed only" in warning for warning in guarded.warnings)
     assert any("swept its whole range" in warning for warning in guarded.warnings)
-    plain = fit(train, None, SPEC, FitConfig(hidden=(64, 64), epochs=30, inputs="pressure"))
+    plain = fit(train, None, SPEC, replace(QUICK, epochs=20, inputs="pressure"))
     assert rmse(guarded.model, test) <= 1.1 * rmse(plain.model, test)
 
 
@@ -104,7 +104,7 @@ def test_excitation_distinguishes_a_random_walk_from_a_traverse():
 
 def test_same_seed_same_weights():
     rng = np.random.default_rng(1)
-    train, valid = (history([walk(n, rng) for _ in range(4)], noise=NOISE) for n in (100, 50))
+    train, valid = (history([walk(n, rng) for _ in range(4)], noise=NOISE) for n in (50, 50))
     config = FitConfig(hidden=(16,), epochs=3, effects=("hysteresis",))
     one, other = (fit(train, valid, SPEC, config).model.state_dict() for _ in range(2))
     assert one.keys() == other.keys()
@@ -119,9 +119,8 @@ def test_missing_key_points_neither_count_nor_spread(walks):
     gappy = pack(
         list(train.t_s), list(train.pressure), list(points)
     )  # four runs of equal length: no padding
-    result, whole = (
-        fit(each, valid, SPEC, replace(QUICK, inputs="pressure")) for each in (gappy, train)
-    )
+    config = replace(QUICK, epochs=20, learning_rate=1e-2, inputs="pressure")
+    result, whole = (fit(each, valid, SPEC, config) for each in (gappy, train))
     assert rmse(result.model, test) < 1.1 * rmse(whole.model, test)
 
 
@@ -129,13 +128,14 @@ def test_constant_curvature_recovers_a_constant_curvature_arm():
     """Without hysteresis the truth is one arc, linear but for its stretch: 1 % of the motion."""
     rng = np.random.default_rng(5)
     train = history([walk(400, rng)], hysteresis=0.0, noise=0.02)
-    result = fit(train, None, SPEC, FitConfig(network="constant_curvature", epochs=100))
+    result = fit(train, None, SPEC, FitConfig(network="constant_curvature", epochs=30))
     assert rmse(result.model, train) < 0.015 * spread(train)
 
 
 def test_recurrent_baseline_learns(walks):
     train, valid, test = walks
-    result = fit(train, valid, SPEC, FitConfig(network="recurrent", epochs=30))
+    config = FitConfig(network="recurrent", epochs=20, learning_rate=1e-2)
+    result = fit(train, valid, SPEC, config)
     assert rmse(result.model, test) < 0.1 * spread(test)
 
 
@@ -228,11 +228,11 @@ def lagging(rows: int, seed: int, dt_s: float = 0.1):
 
 
 def test_a_lag_of_the_line_is_fitted_through_whole_runs():
-    runs = [lagging(400, seed) for seed in range(8)]
+    runs = [lagging(300, seed) for seed in range(8)]
     train, valid = (
         pack(*([run[k] for run in part] for k in range(3))) for part in (runs[:6], runs[6:])
     )
-    config = replace(SMALL, hidden=(48, 48), effects=("line_lag",))
+    config = replace(SMALL, hidden=(48, 48), epochs=40, learning_rate=1e-2, effects=("line_lag",))
     result = fit(train, valid, SPEC, config)
     stage = result.stages[-1]
     assert stage.kept
@@ -258,13 +258,13 @@ SMALL = FitConfig(hidden=(32, 32), epochs=60, inputs="pressure", batch=128, prio
 
 
 def test_an_ensemble_knows_its_error_on_runs_that_took_no_part():
-    train, fresh = runs(range(12)), runs(range(50, 62))
-    result = fit(train, None, SPEC, replace(SMALL, members=4))
+    train, fresh = runs(range(12), length=40), runs(range(50, 62))
+    result = fit(train, None, SPEC, replace(SMALL, members=4, learning_rate=1e-2))
     assert isinstance(result.model.network, HawEnsemble)
     interval = result.model.validation.interval
     assert interval.source == "cross-validation"
     assert interval.groups == 10, "two of twelve runs are held out"
-    assert interval.rows == 1500
+    assert interval.rows == 400
     found = result.model.predict_interval(fresh)
     error = (found.key_points_mm - fresh.key_points).norm(dim=-1)
     assert 0.91 <= coverage_of(error, found.radius_mm) <= 0.985
@@ -275,18 +275,18 @@ def test_an_ensemble_knows_its_error_on_runs_that_took_no_part():
 def test_an_ensemble_ends_where_it_is_best_on_runs_that_its_members_left_out():
     """Few noisy runs: the error of left-out runs falls for some epochs, and then rises."""
     rng = np.random.default_rng(5)
-    train, fresh = (history([walk(n, rng) for _ in range(6)], seed=n) for n in (60, 150))
+    train, fresh = (history([walk(n, rng) for _ in range(6)], seed=n) for n in (40, 150))
     noise = 2.0 * torch.randn(train.key_points.shape, generator=torch.Generator().manual_seed(0))
     noisy = replace(train, key_points=train.key_points + noise)
-    how = {"hidden": (64, 64), "learning_rate": 1e-2, "batch": 128, "inputs": "pressure"}
+    how = {"hidden": (128, 128), "learning_rate": 3e-2, "batch": 128, "inputs": "pressure"}
     errors, held = {}, {}
-    for epochs in (30, 300):
+    for epochs in (20, 100):
         config = FitConfig(members=3, epochs=epochs, prior="none", **how)
         result = fit(noisy, None, SPEC, config)
         held[epochs] = [row[3] for row in result.loss if row[0] == "ensemble"]
         errors[epochs] = rmse(result.model, fresh)
-    assert held[300][-1] > 1.1 * min(held[300]), "else the last weights are the best ones"
-    assert errors[300] < 1.1 * errors[30]
+    assert held[100][-1] > 1.1 * min(held[100]), "else the last weights are the best ones"
+    assert errors[100] < 1.1 * errors[20]
 
 
 def test_a_single_network_states_an_interval_of_its_held_out_rows():
@@ -300,11 +300,12 @@ def test_a_single_network_states_an_interval_of_its_held_out_rows():
 
 
 def test_auto_finds_the_lag_of_the_line():
-    some = [lagging(300, seed) for seed in range(8)]
+    some = [lagging(200, seed) for seed in range(8)]
     train, valid = (
         pack(*([run[k] for run in part] for k in range(3))) for part in (some[:6], some[6:])
     )
-    result = fit(train, valid, SPEC, replace(SMALL, effects=("auto",), epochs=80))
+    config = replace(SMALL, effects=("auto",), epochs=20, learning_rate=1e-2)
+    result = fit(train, valid, SPEC, config)
     assert "line_lag" in result.model.effects
     stage = next(stage for stage in result.stages if stage.name == "line_lag")
     assert stage.tried_mm["line_lag"] == min(stage.tried_mm.values())
@@ -321,7 +322,7 @@ def test_auto_adds_nothing_to_an_arm_without_memory():
 def test_auto_tries_the_effects_that_ask_for_it(monkeypatch):
     asking = replace(hypothesis_of(Twist), memory="time")
     monkeypatch.setattr(sys.modules[Twist.__module__], "HYPOTHESIS", asking)
-    timed = runs(range(10))
+    timed = runs(range(5), length=60)
     of_time = {"line_lag", "rate_dependence", "creep", "twist"}
     for recorded, tried in (
         (timed, {"hysteresis"} | of_time),

@@ -51,7 +51,7 @@ def test_two_hidden_effects_are_found_added_and_judged(tmp_path, capsys):
     """Nothing by rote here: the diagnosis has to name creep and gains by itself."""
     truth = with_truth("gain_mismatch", {"gain": [0.06, -0.02, -0.05]}, TRUTHS["creep"])
     save_model(bare_arm(), tmp_path / "arm")
-    both = measured_on(truth)
+    both = measured_on(truth, rows=250)
     save_recording(both, tmp_path / "both.parquet")
     command = ["improve", str(tmp_path / "arm"), str(tmp_path / "both.parquet")]
     options = ["--json", str(tmp_path / "rounds.json"), "--report", str(tmp_path / "report")]
@@ -88,7 +88,7 @@ def test_with_recordings_from_before_only_what_has_changed_is_added(tmp_path, ca
     turned = TRUTHS["misalignment"]
     now = with_truth("creep", {"amount": [0.15], "log_tau": [2.0], "log_width": [0.3]}, turned)
     now = with_truth("gain_mismatch", {"gain": [0.06, -0.02, -0.05]}, now)
-    before, after = measured_on(turned, rows=250), measured_on(now, rows=250, noise_seed=5)
+    before, after = measured_on(turned, rows=200), measured_on(now, rows=200, noise_seed=5)
     after = replace(after, name="after")
     save_model(bare_arm(), tmp_path / "arm")
     save_recording(before, tmp_path / "before.parquet")
@@ -111,8 +111,8 @@ def test_with_recordings_from_before_only_what_has_changed_is_added(tmp_path, ca
     assert set(load_model(tmp_path / "new").effects) == {"creep", "gain_mismatch"}
     own = np.square(
         (
-            measured_on(turned, rows=250, noise_seed=5).key_points_mm
-            - measured_on(bare_arm(), rows=250).key_points_mm
+            measured_on(turned, rows=200, noise_seed=5).key_points_mm
+            - measured_on(bare_arm(), rows=200).key_points_mm
         )[rows]
     )
     assert values["error_model_mm"]["after"] == pytest.approx(
@@ -150,7 +150,7 @@ def test_an_effect_a_little_beyond_plausibility_is_held_at_its_end(recited):
     """A share of 1.3 of the line, where 1.05 is the most: a longer lag does nearly as much."""
     truth = with_truth("line_lag", {"share": 1.3, "log_up": math.log(0.5), "log_down": 0.0})
     recited(said("identified", "line_lag"), said("nothing_missing"))
-    result = improve(bare_arm(), [measured_on(truth, rows=600)])
+    result = improve(bare_arm(), [measured_on(truth, rows=300)])
     assert [name for name, _ in result.steps if name != NETWORK] == ["line_lag"]
     share = next(p for p in result.parameters if p.name == "share")
     assert share.value == pytest.approx(1.05, abs=1e-3)
@@ -163,14 +163,14 @@ def test_a_plausible_effect_takes_the_place_of_one_that_fits_beyond_plausibility
     truth = with_truth("line_lag", {"share": 1.0, "log_up": math.log(0.06), "log_down": 0.0})
     either = replace(said("ambiguous", "inertia", "line_lag"), ambiguous_with=("line_lag",))
     recited(either, said("nothing_missing"))
-    result = improve(bare_arm(), [measured_on(truth, rows=300)])
+    result = improve(bare_arm(), [measured_on(truth, rows=200)])
     assert [name for name, _ in result.steps if name != NETWORK] == ["line_lag"]
     assert result.rounds[0].competing == ("inertia",)
     assert "line_lag in its place: inertia would lower the error" in result.rounds[0].sentence
     assert "only with an implausible" in result.rounds[0].sentence
     assert result.claimed
     recited(said("identified", "inertia"), said("nothing_missing"))
-    alone = improve(bare_arm(), [measured_on(truth, rows=300)])
+    alone = improve(bare_arm(), [measured_on(truth, rows=200)])
     assert [name for name, _ in alone.steps if name != NETWORK] == ["inertia"]
 
 
@@ -185,7 +185,7 @@ def test_alternatives_are_what_the_diagnosis_cannot_tell_from_the_effect():
 
 
 def test_the_loop_ends_when_an_effect_is_named_again_or_enough_were_added(recited):
-    recording = measured_on(TRUTHS["creep"], rows=300)
+    recording = measured_on(TRUTHS["creep"], rows=150)
     recited(said("identified", "creep"), said("identified", "creep"))
     again = improve(bare_arm(), [recording])
     assert [name for name, _ in again.steps] == ["creep"]
@@ -208,7 +208,7 @@ def test_the_form_of_an_effect_is_chosen_beside_the_others(recited):
     """Gains that were fitted alone have taken over some of the drift, and what is left looks like
     gains that drift."""
     recited(said("identified", "gain_mismatch"), said("identified", "drift"), said("cannot_tell"))
-    result = improve(bare_arm(), [measured_on(yielding())])
+    result = improve(bare_arm(), [measured_on(yielding(), rows=250)])
     assert [r.step for r in result.rounds if r.step != NETWORK] == ["gain_mismatch", "drift", None]
     assert result.model.effects["drift"].kind == "base"
     assert result.held_out.after < 1.15 * math.sqrt(3) * NOISE_MM
@@ -226,7 +226,7 @@ def test_an_effect_that_is_named_again_is_sought_in_another_form(recited, monkey
     monkeypatch.setattr(loop, "fit_effects", first_in_a_wrong_form)
     recited(*[said("identified", "drift")] * 3)
     truth = with_truth("drift", {"turn": [0.03, -0.02, 0.0], "log_tau": 6.5}, kind="base")
-    result = improve(bare_arm(), [measured_on(truth)])
+    result = improve(bare_arm(), [measured_on(truth, rows=250)])
     done = [(r.step, r.anew) for r in result.rounds if r.step != NETWORK]
     assert done == [("drift", False), ("drift", True), (None, False)]
     assert result.model.effects["drift"].kind == "base"
@@ -272,7 +272,7 @@ def test_rounds_are_reported_as_they_end(recited):
 def test_the_second_effect_of_an_answer_does_not_repeat_its_sentence(recited):
     recited(said("several", "creep", "gain_mismatch"), said("nothing_missing"))
     truth = with_truth("gain_mismatch", {"gain": [0.06, -0.02, -0.05]}, TRUTHS["creep"])
-    result = improve(bare_arm(), [measured_on(truth)])
+    result = improve(bare_arm(), [measured_on(truth, rows=200)])
     assert [r.step for r in result.rounds] == ["creep", "gain_mismatch", None]
     assert result.rounds[0].sentence == "several it is"
     assert result.rounds[1].sentence == "named beside creep by the same diagnosis"

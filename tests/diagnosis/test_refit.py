@@ -109,15 +109,21 @@ def found(problem):
     return refit(problem, without=["hysteresis", "inertia", "softening"], config=SHORT)
 
 
+@pytest.fixture(scope="module")
+def unasked(lagging):
+    """A diagnosis of the lagging arm that may not refit."""
+    recording, model = lagging
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(diagnosing, "fit_candidates_together", None)
+        return diagnosing.diagnose(model, [recording], refit="never")
+
+
 @pytest.fixture
 def short(monkeypatch):
     """The commands with a budget of seconds and one candidate, in this process."""
     monkeypatch.setattr(refitting, "hideable", lambda *given: (["line_lag"], {}))
     together = partial(refit, config=SHORT)
     monkeypatch.setattr(diagnosing, "fit_candidates_together", together)
-    monkeypatch.setattr(amending, "refit_effects", together)
-    for module in (amending, improving):
-        monkeypatch.setattr(module, "fit_together", partial(fit_together, config=SHORT))
     monkeypatch.setattr(diagnose_command, "REFIT_PROCESSES", 1)
 
 
@@ -263,20 +269,28 @@ def test_left_out_rows_are_no_part_of_a_training(problem, monkeypatch):
     assert (parts[~inside] == 0).all()
 
 
-def test_the_same_seed_gives_the_same_result_and_another_seed_another(problem):
+def test_the_same_seed_gives_the_same_result_and_another_seed_another(problem, monkeypatch):
     brief = replace(SHORT, early_epochs=1, first_epochs=1, epochs=1)
     first, other = (
         refit(problem, together=["line_lag"], config=replace(brief, seed=seed)) for seed in (0, 1)
     )
+    asked, pool = [], refitting.workers
+
+    def one_worker(count, begin):
+        asked.append(count)
+        return pool(1, begin)
+
+    monkeypatch.setattr(refitting, "workers", one_worker)
     both = refit(problem, together=["line_lag"], config=brief, processes=2)
-    assert replace(both, seconds=0.0) == replace(first, seconds=0.0), "again, in two processes"
+    assert asked == [2]
+    assert replace(both, seconds=0.0) == replace(first, seconds=0.0), "again, in another process"
     assert first.candidates[0].heldout_rmse_mm != other.candidates[0].heldout_rmse_mm
 
 
 def test_a_clean_model_at_its_floor_costs_nothing(monkeypatch):
     """A network that fits an arm without a lag: auto does not start a refit; never and always."""
     recording = arm_by_hand(lag_s=0.0)
-    model = fitted_to(recording, epochs=150)
+    model = fitted_to(recording, epochs=80, learning_rate=1e-2)
     clean = identification_problem(model, [recording])
     assert clean.rmse_mm < 2.0 * clean.floor_mm
     assert reason_to_refit(clean) == ""
@@ -292,12 +306,10 @@ def test_a_clean_model_at_its_floor_costs_nothing(monkeypatch):
     assert diagnosing.diagnose(model, [recording]).refit is None
 
 
-def test_never_does_not_refit_where_auto_would(lagging, monkeypatch):
-    recording, model = lagging
-    monkeypatch.setattr(diagnosing, "fit_candidates_together", None)
-    found = diagnosing.diagnose(model, [recording], refit="never")
-    assert found.refit is None
-    assert found.to_json()["refit"] is None
+def test_never_does_not_refit_where_auto_would(problem, unasked):
+    assert reason_to_refit(problem)
+    assert unasked.refit is None
+    assert unasked.to_json()["refit"] is None
 
 
 @pytest.mark.parametrize(
@@ -371,11 +383,10 @@ def named(effect: str | None, found) -> Diagnosis:
     return Diagnosis(verdict, ErrorLevels(2.0, 0.1, 1.0), (row, replace(row, effect="line_lag")))
 
 
-def test_without_a_winner_an_effect_that_was_tried_is_not_named_any_more(problem, found):
+def test_without_a_winner_an_effect_that_was_tried_is_not_named_any_more(problem, found, unasked):
     """The residuals name creep, but the network alone does as well; or a payload, which stays."""
     none = replace(found, winner=None, competing=(), of_line=False, confidence=0.0)
-    known = diagnosing.diagnose(problem.model, [arm_by_hand(rows=800)], refit="never")
-    given = {"statistics": known.statistics, "probabilities": known.probabilities}
+    given = {"statistics": unasked.statistics, "probabilities": unasked.probabilities}
     result = with_refit(replace(named("creep", none), **given), none, problem)
     assert result.verdict.effects == ()
     assert result.verdict.kind not in ("identified", "several", "ambiguous")
@@ -399,8 +410,9 @@ def test_the_refit_decides_over_the_residuals(problem, found):
 
 
 def test_command_and_python_say_the_same_and_amend_makes_the_error_fall(
-    lagging, tmp_path, capsys, short
+    lagging, tmp_path, capsys, short, monkeypatch
 ):
+    """`amend` and `improve` are given the refit of `diagnose`: theirs is of the same rows."""
     recording, model = lagging
     save_model(model, tmp_path / "arm")
     save_recording(recording, tmp_path / "hand.parquet")
@@ -420,6 +432,23 @@ def test_command_and_python_say_the_same_and_amend_makes_the_error_fall(
     assert written["refit"]["candidates"] == json.loads(json.dumps(rows))
     assert written["refit"]["winner"] == "line_lag"
     assert "Fitted together" in (tmp_path / "r" / "diagnosis.html").read_text()
+    joint = []
+
+    def found_before(posed, *given, **options):
+        assert posed.rmse_mm == called.error_mm.before
+        return called.refit
+
+    def fitted_once(posed, names, judged, **options):
+        assert list(names) == ["line_lag"]
+        assert judged == called.refit.of("line_lag")
+        if not joint:
+            joint.append(fit_together(posed, names, judged, SHORT))
+        return joint[0]
+
+    monkeypatch.setattr(amending, "refit_effects", found_before)
+    monkeypatch.setattr(diagnosing, "fit_candidates_together", found_before)
+    for module in (amending, improving):
+        monkeypatch.setattr(module, "fit_together", fitted_once)
     amended = amending.amend(arm, data, "line_lag")
     assert amended.claimed
     assert amended.held_out.after < 0.5 * amended.held_out.before
@@ -483,15 +512,20 @@ def test_a_network_that_needs_no_training_stays_as_it_is(problem, lagging, found
     def joint(*given, **options):
         raise AssertionError("fitted together")
 
+    def known(posed, effects, *given):
+        assert posed.model is clean
+        assert list(effects) == ["line_lag"]
+        return apart
+
     monkeypatch.setattr(amending, "refit_reason", lambda *given: "the network may imitate it")
     monkeypatch.setattr(amending, "fit_together", joint)
     monkeypatch.setattr(amending, "refit_effects", judged(1.1 * apart))
+    monkeypatch.setattr(amending, "apart_mm", known)
     amended = amending.amend(clean, [lagging[0]], "line_lag")
     assert amended.refit is None
     assert amended.claimed
     assert any("it stays as it is" in note for note in amended.notes)
     monkeypatch.setattr(amending, "refit_effects", judged(0.5 * apart))
-    monkeypatch.setattr(amending, "apart_mm", lambda *given: apart)
     with pytest.raises(AssertionError, match="fitted together"):
         amending.amend(clean, [lagging[0]], "line_lag")
 

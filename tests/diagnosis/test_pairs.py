@@ -254,7 +254,7 @@ def rig_takes():
     takes = []
     for take, hidden in ((1, ()), (2, (("payload", 1.5),))):
         rig = VirtualRig(0, take=take, hidden=hidden)
-        takes.append(rig.record(make_protocol("mixed", rig.limits, 2400, seed=5))[0])
+        takes.append(rig.record(make_protocol("mixed", rig.limits, 1500, seed=5))[0])
     before, after = takes
     columns = ("measured", "key_points_mm", "commanded", "run", "temp_C")
     cut = {name: getattr(after, name)[50:] for name in columns}
@@ -639,7 +639,7 @@ def test_what_the_model_lacked_before_the_change_is_said(own):
     takes = []
     for take, hidden in ((1, ()), (2, (("payload", 1.5),))):
         rig = VirtualRig(0, take=take, hidden=(*own, *hidden))
-        takes.append(rig.record(make_protocol("mixed", rig.limits, 2400, seed=5))[0])
+        takes.append(rig.record(make_protocol("mixed", rig.limits, 1500, seed=5))[0])
     before, after = takes
     notes = amend(default_arm(), [after], "payload", before=[before], retune_network=False).notes
     if not own:
@@ -677,10 +677,12 @@ def test_pairing_without_before_is_refused(model, tmp_path, capsys):
     assert "--before" in capsys.readouterr().err
 
 
-def test_command_and_function_give_the_same(rig_takes, tmp_path):
-    before, after = rig_takes
-    save_model(default_arm(), tmp_path / "arm")
-    for each in rig_takes:
+def test_command_and_function_give_the_same(model, tmp_path):
+    save_model(model, tmp_path / "arm")
+    motion = smooth_walk(10)
+    before = made(motion, 0.0, seed=2, name="before")
+    after = made(motion, 2.0, name="after", change=lambda p: 0.5 + 0.0 * p[:, 0])
+    for each in (before, after):
         save_recording(each, tmp_path / f"{each.name}.parquet")
     arm, after, before = (str(tmp_path / n) for n in ("arm", "after.parquet", "before.parquet"))
     out, page, replay = (tmp_path / n for n in ("out.json", "page", "change.rrd"))

@@ -180,7 +180,7 @@ def test_what_is_within_chance_and_small_is_not_proposed(table):
 def test_no_share_of_what_can_be_explained_is_above_one():
     """Creep explains nearly all, and the sidecar states a noise that is larger than the error."""
     rig = VirtualRig(0, take=5, hidden=(("creep", 1.0),))
-    recording, _ = rig.record(make_protocol("mixed", rig.limits, 2400, seed=5))
+    recording, _ = rig.record(make_protocol("mixed", rig.limits, 1200, seed=5))
     loud = replace(recording, noise_mm=2.0)
     problem = problem_of(load_model("default"), [loud], part="training")
     assert problem.rmse_mm < problem.floor_mm
@@ -192,7 +192,7 @@ def test_no_share_of_what_can_be_explained_is_above_one():
 
 def test_two_effects_of_a_robot_are_proposed_together():
     rig = VirtualRig(0, take=3, hidden=(("creep", 1.2), ("payload", 1.2)))
-    recording, _ = rig.record(make_protocol("mixed", rig.limits, 6000, seed=3))
+    recording, _ = rig.record(make_protocol("mixed", rig.limits, 3000, seed=3))
     model, known = load_model("default"), load_training_residuals("default")
     found = diagnose(model, [recording], reference=known)
     assert found.ranking[0].effect in ("creep", "payload")
@@ -223,7 +223,7 @@ def test_what_is_outside_the_list_is_not_called_by_its_nearest_relative(name):
     """A leak has nearly the form of a gain, a breaking fibre that of a drift; breathing shifts the
     mount only now and then."""
     rig = VirtualRig(0, take=5, hidden=((name, 2.0),))
-    recording, _ = rig.record(make_protocol("mixed", rig.limits, 6000, seed=5))
+    recording, _ = rig.record(make_protocol("mixed", rig.limits, 3000, seed=5))
     model, known = load_model("default"), load_training_residuals("default")
     found = diagnose(model, [recording], reference=known)
     assert found.verdict.kind not in ("nothing_missing", "surrogate_undertrained")

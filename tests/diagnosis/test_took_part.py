@@ -24,7 +24,7 @@ from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.fitted_rows import FittedRows
 
 
-def recorded(take: int, rows: int = 1200) -> Recording:
+def recorded(take: int, rows: int = 600) -> Recording:
     rig = VirtualRig(0, take=take)
     return rig.record(make_protocol("mixed", rig.limits, rows, seed=take))[0]
 
@@ -48,7 +48,7 @@ def other() -> Recording:
 
 @pytest.fixture(scope="module")
 def model(known):
-    return fit(known, effects=[], hidden=(8,), epochs=1).model
+    return fit(known, effects=[], hidden=(8,), epochs=1, prior="none").model
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,7 @@ def arm(model, tmp_path_factory):
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-@pytest.mark.parametrize("rows", [slice(300, 700), slice(0, None, 5)])
+@pytest.mark.parametrize("rows", [slice(150, 350), slice(0, None, 5)])
 def test_a_test_on_rows_of_the_fit_is_refused(model, known, other, suffix, rows, tmp_path):
     """Under another name, cut, thinned, in either format, and beside a recording that is new."""
     file = tmp_path / f"renamed{suffix}"
@@ -98,7 +98,7 @@ def test_compare_says_what_the_error_is_no_test_of(model, known, other, tmp_path
 
 
 def test_commands_refuse_in_one_line(arm, known, other, tmp_path, capsys):
-    files = {"known": known, "other": other, "part": part_of(known, np.arange(100, 500))}
+    files = {"known": known, "other": other, "part": part_of(known, np.arange(50, 250))}
     for name, recording in files.items():
         save_recording(recording, tmp_path / f"{name}.csv")
     given = [str(arm), str(tmp_path / "part.csv"), "--test", "--json", str(tmp_path / "x.json")]

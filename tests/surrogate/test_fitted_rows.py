@@ -29,7 +29,7 @@ def pair() -> tuple[Recording, Recording]:
 
 @pytest.fixture(scope="module")
 def model(pair):
-    return fit(pair[0], effects=[], hidden=(8,), epochs=1).model
+    return fit(pair[0], effects=[], hidden=(8,), epochs=1, prior="none").model
 
 
 def test_a_part_of_a_recording_is_recognised_under_any_name(pair, model):
@@ -57,7 +57,7 @@ def test_a_sketch_is_small_and_joins_as_the_rows_do(pair):
 
 def test_rows_that_only_chose_the_model_are_not_called_fitted(pair):
     """Training rows in the one, held-out ones in the other, some in both."""
-    known = fit(pair[0], valid=pair[1], effects=[], hidden=(8,), epochs=1).model
+    known = fit(pair[0], valid=pair[1], effects=[], hidden=(8,), epochs=1, prior="none").model
     notes = " ".join(open_inputs(known, list(pair))[2])
     assert "the model was fitted to 100 % of its rows: the error there is no test; use" in notes
     assert "the model was chosen, not trained, by 100 % of its rows: the error there is n" in notes

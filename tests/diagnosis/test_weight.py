@@ -25,9 +25,9 @@ def arm():
 
 @pytest.fixture(scope="module")
 def turned(arm):
-    """Three minutes of the model's own robot, bare, with its base rolled by 90 degrees."""
+    """A minute and a half of the model's own robot, bare, with its base rolled by 90 degrees."""
     rig = VirtualRig(0, take=7, roll_deg=90.0)
-    return rig.record(make_protocol("mixed", rig.limits, 3600, seed=2))[0]
+    return rig.record(make_protocol("mixed", rig.limits, 1800, seed=2))[0]
 
 
 def test_the_same_direction_changes_nothing(arm, turned):

@@ -210,7 +210,7 @@ def test_a_bad_input_gets_one_line(lab, says, capsys):
 def test_the_error_falls_on_a_rig_whose_creep_has_another_form():
     """The rig's creep is a nonlinear ladder (Findley 1976); the tool's is a log-normal spectrum."""
     rig = VirtualRig(0, hidden=[("creep", 1.0)])
-    recording, _ = rig.record(make_protocol("mixed", rig.limits, 2400, seed=3))
+    recording, _ = rig.record(make_protocol("mixed", rig.limits, 1200, seed=3))
     assert isinstance(recording, Recording)
     result = amend(default_arm(), [recording], ["creep"])
     assert result.held_out.claimed
@@ -223,7 +223,7 @@ def test_a_network_is_retuned_behind_an_effect_that_is_there_and_earns_it_no_cla
     off = bare_arm()
     with torch.no_grad():
         off.network.layers[-1].bias += 0.02
-    with_creep = measured_on(TRUTHS["creep"], rows=800)
+    with_creep = measured_on(TRUTHS["creep"], rows=250)
     both, kept = (amend(off, [with_creep], ["creep"], tune) for tune in (True, False))
     assert both.claimed
     assert both.retuned
@@ -231,7 +231,7 @@ def test_a_network_is_retuned_behind_an_effect_that_is_there_and_earns_it_no_cla
     assert both.alone == kept.held_out
     assert both.held_out.after < 0.7 * kept.held_out.after
     assert both.held_out.after < 1.5 * both.held_out.floor
-    without = amend(off, [measured_on(bare_arm())], ["creep"])
+    without = amend(off, [measured_on(bare_arm(), rows=200)], ["creep"])
     assert not without.claimed
     assert not without.retuned
     assert without.held_out == without.alone

@@ -77,11 +77,15 @@ def test_the_lines_of_the_map_mend_like_apply(name, tmp_path):
     assert find_setup_faults(default_arm(), [part.recording]) is None
 
 
+ROWS = 1000
+"""Rows of the recordings that commands are given."""
+
+
 @pytest.fixture
 def folder(tmp_path):
-    wrong = turned(measured(), [0.0, 0.0, 1.5], [40.0, 0.0, 0.0])
+    wrong = turned(measured(ROWS), [0.0, 0.0, 1.5], [40.0, 0.0, 0.0])
     save_recording(replace(wrong, name="day2"), tmp_path / "day2.parquet")
-    save_recording(measured(), tmp_path / "day1.parquet")
+    save_recording(measured(ROWS), tmp_path / "day1.parquet")
     return tmp_path
 
 
@@ -97,7 +101,7 @@ def test_apply_writes_what_is_mended_and_nothing_else(folder, capsys):
     assert (folder / "day2.parquet").read_bytes() == before
     assert sorted(path.name for path in out.iterdir()) == ["day2.parquet", "day2.toml"]
     corrected = load_recording(out / "day2.parquet")
-    apart = corrected.key_points_mm - measured().key_points_mm
+    apart = corrected.key_points_mm - measured(ROWS).key_points_mm
     assert np.abs(apart).max() < 0.1
     plain = json.loads((folder / "found.json").read_text())
     assert plain["verdict"]["kind"] == "setup"
@@ -133,7 +137,7 @@ def test_compare_points_to_diagnose(folder, capsys):
 
 
 def test_a_wrong_unit_of_length_is_named_by_the_command(folder, capsys):
-    wrong = with_points(measured(), measured().key_points_mm / 1000)
+    wrong = with_points(measured(ROWS), measured(ROWS).key_points_mm / 1000)
     save_recording(wrong, folder / "metres.parquet")
     assert run(["diagnose", "default", str(folder / "metres.parquet")]) == 0
     text = capsys.readouterr().out

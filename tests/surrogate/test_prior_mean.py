@@ -170,7 +170,7 @@ def test_a_fit_with_prior_mean_round_trips_and_extrapolates(tmp_path):
         path[:, chamber] = walk(150, rng)[:, chamber]
         singly += [path, path[::-1].copy()]
     train, test = history(singly, 0.0), history([walk(300, rng)], 0.0, seed=9)
-    config = FitConfig(hidden=(32, 32), epochs=40, inputs="pressure", batch=128)
+    config = FitConfig(hidden=(32, 32), epochs=20, inputs="pressure", batch=128)
     errors = {}
     for prior in ("none", "arcs"):
         result = fit(train, None, SPEC, replace(config, prior=prior))
@@ -226,7 +226,7 @@ def test_arcs_that_do_worse_on_held_out_runs_are_left_out():
     """Held-out runs of an arm that does what a network makes of chambers that were recorded one by
     one: another network is nearer to it than arcs are."""
     rng = np.random.default_rng(8)
-    train, how = recorded(one_by_one()), {"hidden": (32, 32), "epochs": 60, "inputs": "pressure"}
+    train, how = recorded(one_by_one()), {"hidden": (32, 32), "epochs": 40, "inputs": "pressure"}
     asked = recorded(rng.uniform(0, 50, (300, 2)))
     network = fit(train, None, TWO, FitConfig(prior="none", seed=5, **how)).model
     valid = replace(asked, key_points=network.predict(asked))

@@ -118,7 +118,7 @@ class LaserSite:
     landed: np.ndarray
     """(M,) bool: nothing stands between the tip and the point."""
     clearance_mm: np.ndarray
-    """(M,) mm against all bodies."""
+    """(M,) mm against all bodies and itself."""
     good: np.ndarray
     """(M,) bool: the point can be cut."""
     least_mm: float

@@ -246,6 +246,7 @@ def test_the_command_writes_a_schedule_or_nothing(tmp_path, lagging, capsys):
         ([str(tmp_path / "none"), "-o", str(out)], "no arm model there"),
         ([model, "-o", str(out), "--between", "creep"], "at least two"),
         ([model, "-o", str(out), "--between", "creep,play"], "unknown effect 'play'"),
+        ([model, "-o", str(out), "--minutes", "0.5"], "--minutes 0.5: too short"),
         ([model, str(tmp_path / "x.csv"), "-o", str(out)], "x.csv"),
     ]
     for arguments, said in bad:

@@ -10,12 +10,21 @@ import numpy as np
 import pytest
 
 from surgisoft.progress import silent
-from surgisoft.scene import mounts
+from surgisoft.scene import frames, mounts
 from surgisoft.scene.batched import BatchedScene
+from surgisoft.scene.capsules import ArmShape
+from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.lesion import Ring
 from surgisoft.scene.mesh import Body
 from surgisoft.scene.mounted_arm import LANDED_MM, TouchPose
-from surgisoft.scene.mounts import EndoscopeSite, LaserSite, TipSite, beams_land, find_mounts
+from surgisoft.scene.mounts import (
+    EndoscopeSite,
+    LaserSite,
+    TipSite,
+    beams_land,
+    find_mounts,
+    laser_sites,
+)
 from surgisoft.scene.reach import ArmReach
 from surgisoft.scene.spec import CameraSpec, LaserSpec, LimitsSpec, MountSpec
 from tests.scene.arc_table import constant_curvature_table
@@ -227,3 +236,38 @@ def test_a_tip_reaches_the_lesion_with_its_clearance(engine, monkeypatch, miss_m
         0
     ]
     assert best.good is good
+
+
+def test_a_laser_cuts_from_no_pose_that_is_too_near_to_a_body(monkeypatch):
+    """A post stands beside the ring: some beams land from poses too near to it, and some arms pass
+    too near on their way. Distances are FCL's."""
+    monkeypatch.setattr(mounts, "MOST_EVALUATED", 40)
+    monkeypatch.setattr(mounts, "ROUNDS", 0)
+    height_mm, count = 80.0, 6
+    beside = np.array([16.0, 0.0, TOP_MM + height_mm / 2])
+    plate = Body("plate", "organ", box((200.0, 200.0, 2 * TOP_MM)))
+    post = box((6.0, 10.0, height_mm))
+    bodies = [plate, Body("post", "support", post, frames.pose_from(np.eye(3), beside))]
+    scene = BatchedScene(bodies, {"laser": RADIUS_MM}, most_nodes=20_000)
+    turn = np.arange(count) * 2 * np.pi / count
+    circle = np.column_stack((8 * np.cos(turn), 8 * np.sin(turn), np.full(count, TOP_MM)))
+    up = np.tile([0.0, 0.0, 1.0], (count, 1))
+    ring = Ring(np.array([0.0, 0.0, TOP_MM]), up[0], circle, up, np.zeros(count, int))
+    table = constant_curvature_table(60.0, counts=(15, 15, 3))
+    reach, limits = ArmReach(*table, np.zeros(3), RADIUS_MM), LimitsSpec(clearance_mm=3.0)
+    checker = CollisionChecker(bodies)
+
+    def too_near(lines_mm):
+        shapes = [{"laser": ArmShape(each, RADIUS_MM)} for each in lines_mm]
+        least = [min(checker.clearance(each).bodies_mm.values()) for each in shapes]
+        return np.array(least) < limits.clearance_mm - 1e-3
+
+    at_work = on_the_way = 0
+    for site in laser_sites(scene, "laser", reach, ring, LaserSpec(), limits, 30.0, silent):
+        near, way = too_near(site.cut.lines_mm), too_near(site.way_mm)
+        assert not (site.good & near).any()
+        assert not (site.good.any() and way.any())
+        at_work += (site.landed & near & ~way.any()).sum()
+        on_the_way += (site.landed & ~near & way.any()).sum()
+    assert at_work > 0
+    assert on_the_way > 0

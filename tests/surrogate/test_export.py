@@ -114,7 +114,7 @@ def test_every_effect_of_the_library_is_exported(exported, bench):
 
 
 def test_files_are_compared_over_whole_recordings(bench, tmp_path, capsys, monkeypatch):
-    """Two runs of different length, without the padding; steps of another arm would be noticed.
+    """Two runs of different length; steps of another arm would be noticed.
 
     TorchScript alone: the other file answers as its module does.
     """

@@ -95,6 +95,7 @@ def write_onnx(
             raise
         except Exception as error:
             raise DoesNotTrace(reason_of(error)) from error
+    _check_runtime(content)
     file.write_bytes(content)
     from onnx.reference import ReferenceEvaluator
 
@@ -161,6 +162,24 @@ def reason_of(error: Exception) -> str:
     cause = error.__cause__ or error
     lines = [line.strip() for line in str(cause).splitlines() if line.strip()]
     return f"{type(cause).__name__}: {lines[0][:140]}" if lines else type(cause).__name__
+
+
+def _check_runtime(content: bytes) -> None:
+    """Raise DoesNotTrace where onnxruntime is installed and cannot open a file.
+
+    The reference evaluator knows every operator for every type, onnxruntime does not.
+    """
+    try:
+        import onnxruntime
+    except ImportError:
+        return
+    options = onnxruntime.SessionOptions()
+    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+    options.log_severity_level = 4
+    try:
+        onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    except Exception as error:
+        raise DoesNotTrace(f"onnxruntime cannot open it: {reason_of(error)}") from error
 
 
 @contextlib.contextmanager

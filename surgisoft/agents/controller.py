@@ -417,6 +417,9 @@ def _where(mask: Tensor, yes: Any, no: Any) -> Any:
     """`yes` where the (1,) mask holds, else `no`: for each tensor of two pytrees."""
 
     def pick(a: Tensor, b: Tensor) -> Tensor:
-        return torch.where(mask.view(-1, *[1] * (a.ndim - 1)), a, b)
+        this = mask.view(-1, *[1] * (a.ndim - 1))
+        if a.dtype == torch.bool:  # onnxruntime has no Where of truth values
+            return (this & a) | (~this & b)
+        return torch.where(this, a, b)
 
     return tree_map(pick, yes, no)

@@ -238,8 +238,10 @@ def _numpy(folder: Path, about: dict) -> Function:
 def _onnxruntime(folder: Path, about: dict) -> Function:
     import onnxruntime
 
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3  # errors: it warns of what it cannot simplify
     session = onnxruntime.InferenceSession(
-        str(folder / about["onnx"]), providers=["CPUExecutionProvider"]
+        str(folder / about["onnx"]), options, providers=["CPUExecutionProvider"]
     )
     return lambda given: list(session.run(about["outputs"], given))
 

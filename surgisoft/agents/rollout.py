@@ -12,6 +12,7 @@ from torch import Tensor
 from surgisoft.agents.policies import Policy
 from surgisoft.errors import InputError, Interrupted
 from surgisoft.progress import Progress, silent
+from surgisoft.tasks.arguments import actions_of
 from surgisoft.tasks.base import Episodes, Outcome, Task, TaskState
 from surgisoft.tasks.episodes.log import EpisodeLog, EpisodeRecorder
 from surgisoft.tasks.graphed import donated_episodes
@@ -159,6 +160,7 @@ def _rolled_out(
     where a CUDA graph steps it."""
     runner, device = donated_episodes(task, count), task.world.device
     state = runner.seeded(seed, count, first)
+    sizes = {agent: task.world.arms[agent].chambers for agent in task.agents}
     at = torch.arange(count, device=device)
     live = torch.ones(count, dtype=torch.bool, device=device)
     steps = torch.zeros(count, dtype=torch.int64, device=device)
@@ -168,7 +170,8 @@ def _rolled_out(
     if watch:
         watch(Instant(first + at, state, None, None, live))
     for step in range(task.steps):
-        actions = policy.act(task, state, runner.observe(state))
+        shapes = {agent: (len(live), size) for agent, size in sizes.items()}
+        actions = actions_of(policy.act(task, state, runner.observe(state)), shapes, device)
         state, outcome = runner.step(state, actions)
         if watch:
             watch(Instant(first + at, state, actions, outcome, live))

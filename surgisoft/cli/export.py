@@ -108,7 +108,8 @@ def _run(source: Path, output: Path, which: str, check: bool) -> tuple[list[Path
     if not (output / "controller.py").is_file():
         note = read_json(output / "policy.json")["note"]
         print(f"controller: not exported, only the policies: {note}")
-    elif check:
+        return files, not check
+    if check:
         with progress("one episode on the virtual rig"):
             found = check_on_rig(Controller(output), task, policy)
         for line in _compared(found):

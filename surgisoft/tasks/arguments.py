@@ -72,7 +72,7 @@ def actions_of(
     held = {}
     for agent, expected in shapes.items():
         if agent not in actions:
-            raise InputError(f"no action for {agent}: expected {agents}")
+            raise InputError(f"no action for '{agent}', expected one for each of {agents}")
         try:
             given = actions[agent]
             if not isinstance(given, Tensor):

@@ -11,6 +11,7 @@ import onnx
 import pytest
 import torch
 from onnx.reference import ReferenceEvaluator
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from surgisoft.agents import export as exporting
 from surgisoft.agents.controller import ControllerGraph
@@ -35,6 +36,7 @@ from surgisoft.agents.rig_check import (
 from surgisoft.agents.training import train_new
 from surgisoft.cli import run as surgisoft
 from surgisoft.errors import InputError
+from surgisoft.graphs import DoesNotTrace, write_onnx
 from surgisoft.rig.motion_capture import CameraDesign
 from surgisoft.rig.virtual import VirtualRig
 from surgisoft.tasks.base import Episodes
@@ -146,6 +148,25 @@ def test_the_reference_evaluator_of_onnx_runs_the_file_too(policy, exported):
     assert found.commands_kPa < AGREE_KPA
 
 
+class NoChoiceOfTruths(TorchDispatchMode):
+    """Fails where an operation chooses among truth values: onnxruntime has no such operator."""
+
+    def __torch_dispatch__(self, operation, types, given=(), options=None):
+        if operation.overloadpacket is torch.ops.aten.where and len(given) == 3:
+            assert getattr(given[1], "dtype", None) != torch.bool
+        return operation(*given, **(options or {}))
+
+
+def test_a_file_that_onnxruntime_cannot_open_is_not_written(tmp_path):
+    class Choice(torch.nn.Module):
+        def forward(self, x):
+            return (torch.where(x > 1.0, x > 2.0, x < 0.0).float(),)
+
+    with pytest.raises(DoesNotTrace, match=r"onnxruntime cannot open it: .*Where"):
+        write_onnx(Choice(), (torch.ones(1, 2),), tmp_path / "x.onnx", ["x"], ["y"])
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("name", SHORT)
 def test_the_controller_of_every_task_does_on_the_rig_what_evaluate_does(name):
     task = make_task(name, with_fields(config_of(name), **SHORT[name]))
@@ -155,8 +176,10 @@ def test_the_controller_of_every_task_does_on_the_rig_what_evaluate_does(name):
         agent: torch.nn.Linear(size["observation"], size["chambers"]).requires_grad_(False)
         for agent, size in agent_sizes(task).items()
     }
-    controller = running(ControllerGraph(task, actors))
-    found = check_on_rig(controller, task, ActorPolicy(actors), STRANGE, seed=3)
+    graph = ControllerGraph(task, actors)
+    with NoChoiceOfTruths(), torch.no_grad():
+        graph(*graph.example())
+    found = check_on_rig(running(graph), task, ActorPolicy(actors), STRANGE, seed=3)
     assert found.decisions == DECISIONS
     assert found.closed.points_mm < AGREE_MM
     assert found.closed.commands_kPa < AGREE_KPA

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -124,3 +125,28 @@ def test_progress_ends_at_the_total(task):
 def test_no_episodes_is_one_line(task):
     with pytest.raises(InputError, match="0 episodes"):
         rollout(task, Random(), 0, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("action", "says"),
+    [
+        ({"arm": torch.zeros(1, 3)}, r"action of 'arm' has shape \(1, 3\), expected \(2, 3\)"),
+        ({"arm": torch.zeros(2, 2)}, r"action of 'arm' has shape \(2, 2\), expected \(2, 3\)"),
+        ({}, "no action for 'arm'"),
+    ],
+)
+def test_an_action_of_another_shape_is_one_line(task, action, says):
+    """A step would read what lies behind the numbers of a smaller one."""
+    policy = SimpleNamespace(act=lambda *_: action)
+    with pytest.raises(InputError, match=says):
+        rollout(task, policy, 2, seed=0)
+    play = Episodes(task)
+    with pytest.raises(InputError, match=says):
+        play.step(play.seeded(0, 2), action)
+
+
+def test_a_policy_may_give_its_actions_as_arrays(task):
+    still = SimpleNamespace(act=lambda *_: {"arm": np.zeros((2, 3))})
+    same = SimpleNamespace(act=lambda *_: {"arm": torch.zeros(2, 3)})
+    one, other = (rollout(task, policy, 2, seed=0).returns["arm"] for policy in (still, same))
+    assert torch.equal(one, other)

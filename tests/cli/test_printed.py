@@ -728,6 +728,8 @@ def test_an_export_without_a_controller_says_why(tmp_path, capsys, monkeypatch):
     )  # fmt: skip
     assert "controller: not exported, only the policies: it sees images\n" in out
     assert out.endswith(f"wrote {tmp_path / 'policy.onnx'}\n")
+    assert run(["export", "runs/x", "-o", str(tmp_path), "--check"]) == 1, "what was asked for"
+    assert "not exported" in capsys.readouterr().out
     (tmp_path / "controller.py").touch()
     monkeypatch.setattr("surgisoft.agents.controller_runner.Controller", lambda folder: None)
     right, far = Differences(1.5e-5, 0.00013), Differences(0.35, 1.1)

@@ -69,7 +69,7 @@ def test_arrays_and_tensors_are_the_same_actions():
     ("actions", "says"),
     [
         (np.zeros((2, 3)), "actions are of type ndarray, expected a dict of arm"),
-        ({}, "no action for arm: expected arm"),
+        ({}, "no action for 'arm', expected one for each of arm"),
         ({"arm": "open"}, "action of 'arm' is of type str, expected a tensor or an array of numb"),
         ({"arm": np.zeros((2, 4))}, r"action of 'arm' has shape \(2, 4\), expected \(2, 3\)"),
     ],

@@ -70,7 +70,7 @@ def test_wrong_actions_are_one_line():
     env = surgisoft.batched_env("track_body", 2)
     with pytest.raises(InputError, match=r"shape \(1, 3\), expected \(2, 3\)"):
         env.step({"arm": torch.zeros(1, 3)})
-    with pytest.raises(InputError, match="no action for arm"):
+    with pytest.raises(InputError, match="no action for 'arm'"):
         env.step({})
     with pytest.raises(InputError, match="num_envs is 0"):
         surgisoft.batched_env("track_body", 0)

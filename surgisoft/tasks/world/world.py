@@ -204,7 +204,7 @@ class World:
 
         actions: arm's name -> (B, m) change of the commanded pressure, kPa, clipped to the pumps'
         largest step; `passive` arms need none and hold theirs. power_w: the lasers' power, constant
-        over the step.
+        over the step. Raises InputError where an action is missing or has another shape.
         """
         dt_s, stream, parts = self.config.dt_s, state.stream, {}
         out_mm, move_mm = state.out_mm, None
@@ -215,13 +215,25 @@ class World:
             part = state.arms[name]
             part = part if move_mm is None else fed(part, move_mm)
             held = name in self.passive and name not in actions
-            action = torch.zeros_like(part.command) if held else actions[name]
+            action = torch.zeros_like(part.command) if held else _action(actions, name, part)
             stream, parts[name] = arm.step(stream, part, action, dt_s)
         scene = state.scene
         if self.scene:
             scene = self.scene.step(scene, parts, power_w, dt_s)
         failed = state.failed | _not_finite(parts)
         return WorldState(stream, state.steps + 1, parts, scene, failed, out_mm)
+
+
+def _action(actions: Mapping[str, Tensor], name: str, part: ArmPart) -> Tensor:
+    """An arm's action. The compiled loops of a step read as many numbers as it has to have."""
+    if name not in actions:
+        raise InputError(f"no action for '{name}', expected one for each arm")
+    action, expected = actions[name], part.command.shape
+    if action.shape != expected:
+        raise InputError(
+            f"action of '{name}' has shape {tuple(action.shape)}, expected {tuple(expected)}"
+        )
+    return action
 
 
 class LoneWorld:

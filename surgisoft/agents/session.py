@@ -29,7 +29,7 @@ from surgisoft.progress import Progress, silent
 from surgisoft.scene.folder import Scene, open_scene
 from surgisoft.tasks.base import Episodes, Task
 from surgisoft.tasks.episodes.log import EpisodeLog
-from surgisoft.tasks.path_following import REACHED_MM, Follow
+from surgisoft.tasks.path_following import beyond_reach
 from surgisoft.tasks.registry import (
     config_of,
     make_task,
@@ -294,16 +294,10 @@ def evaluate(
 
 def _warn_of_reach(task: Task, on_warning: Callable[[str], None]) -> None:
     """Warn of a path that leaves the arm's reach: no policy can follow it there."""
-    if not isinstance(task, Follow):
-        return
-    off = task.out_of_reach_mm()
-    beyond = off > REACHED_MM
-    if beyond.any():
+    if beyond := beyond_reach(task):
         on_warning(
-            f"{100 * float(beyond.float().mean()):.0f} % of the path of {task.name} is out of the "
-            f"arm's reach, by up to {float(off.max()):.2f} mm (mean over the path "
-            f"{float(off.mean()):.2f} mm): no policy comes nearer; make the path smaller (size_mm) "
-            "or move its centre (docs/evaluate.md)"
+            f"{beyond}: no policy comes nearer; make the path smaller (size_mm) or move its centre "
+            "(docs/evaluate.md)"
         )
 
 

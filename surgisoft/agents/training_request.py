@@ -18,6 +18,7 @@ from surgisoft.agents.session import task_config
 from surgisoft.agents.training import Result, TrainingProgress, resume, train_new
 from surgisoft.config import COMMAND_LINE, Where, from_table, merged, to_table
 from surgisoft.errors import InputError
+from surgisoft.tasks.path_following import beyond_reach
 from surgisoft.tasks.registry import changed_config, task_names
 from surgisoft.workers import torch_threads
 
@@ -161,17 +162,22 @@ def shortfall(run: TrainedRun) -> str:
         if best["success"] < 1.0:
             why = f"its best policies succeed in {best['success']:.0%} of the episodes"
     elif math.isfinite(error := best.get("error_mm", math.nan)):
-        arms = RunFolder(run.folder).task().world.arms.values()
+        task = RunFolder(run.folder).task()
+        arms = task.world.arms.values()
         known = [arm.model.validation.rmse_mm for arm in arms]
         model = max((each for each in known if each is not None), default=math.inf)
         if error > model:
             why = f"its error of {error:.3g} mm is above that of the arm model ({model:.2g} mm)"
+            if beyond := beyond_reach(task):
+                return (
+                    f"the training did not converge: {why}; {beyond}, where no training helps; "
+                    "make the path smaller (size_mm) or move its centre"
+                )
     elif best:
         why = "no error could be measured in its evaluations"
     if not why:
         return ""
-    task = RunFolder(run.folder).config["task"]
-    usual = steps_for("fast", task)
+    usual = steps_for("fast", RunFolder(run.folder).config["task"])
     more = f"train longer ({usual:,} steps are usual) or " if run.result.steps < usual else ""
     return f"the training did not converge: {why}; {more}try another --seed"
 

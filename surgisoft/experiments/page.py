@@ -64,7 +64,10 @@ def verdict(results: Results) -> str:
     unsafe = max(row["beam_unsafe_longest_s"] for row in results.rows)
     hits = sum(row.get("collided", 0.0) > 0.0 for row in results.rows)
     each = "; ".join(f"{s.label.replace('_', ' ')}: {_one(s)}" for s in settings)
-    if faults:
+    if faults and not any(_broke(results, row) for row in results.rows):
+        first = f"No episode lasted until the fault at {min(f.at_s for f in faults):g} s"
+        first += f"; {each}" if len(settings) <= SHOWN else ""
+    elif faults:
         ended = sum(row["outcome"].startswith("aborted") for row in results.rows)
         first = f"After the fault {ended} of {len(results.rows)} episodes were aborted"
         if _beams(results):
@@ -88,6 +91,11 @@ def verdict(results: Results) -> str:
     safe = "" if faults or not _beams(results) else f" The beam {safe} while it was unsafe."
     last = f" {last}" if "collided" in results.rows[0] else ""
     return f"{first}.{last}{safe}"
+
+
+def _broke(results: Results, row: Row) -> bool:
+    """Whether a fault came before the end of an episode."""
+    return row["time_s"] > min(fault.at_s for fault in results.experiment.faults)
 
 
 def _beams(results: Results) -> bool:

@@ -176,6 +176,10 @@ class PhasedTask:
         goal, plain = state.goal, self.plain(state)
         values = self.base.measures(plain)
         fired = self.supervision.fired(plain)
+        if "pointing_error_mm" in values:  # where the beam has a target: not on the way to rest
+            aims = self.beam[goal.phase]
+            pointing = values["pointing_error_mm"].where(aims, torch.nan)
+            values = values | {"pointing_error_mm": pointing}
         return values | {
             "success": values.get("success", 1.0) * (goal.reason == RUNNING).float(),
             "phase": goal.phase.float(),

@@ -16,6 +16,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from surgisoft.agents.evaluate import RATES, episode_table
@@ -377,7 +378,10 @@ def _rows(
 
 def _timings(task: PhasedTask, result: Rollout) -> dict[str, np.ndarray]:
     """How long each phase took, the beam was on, and was on at the end of an unsafe step, s."""
-    steps = result.measures["phase"]
+    after = result.measures["phase"]
+    # A measure is of the state after its step, which ran in the phase before.
+    before = torch.cat([torch.zeros_like(after[:, :1]), after[:, :-1]], 1)
+    steps = before.masked_fill(after.isnan(), torch.nan)
     found = {
         f"{phase.name}_s": (steps == number).sum(1) * task.dt_s
         for number, phase in enumerate(task.phases)

@@ -31,6 +31,8 @@ FORMAT = 1
 """Version of the file's format."""
 FILE = "experiment.toml"
 """Name of the exact configuration in a folder of results."""
+TIMED = ("at_rim", "beam", "beam_unsafe_longest", "time")
+"""Times in the results that a phase of that name would overwrite by its own, NAME_s."""
 FIRST_TASK = "circle_ablation"
 """The task of files that name none: the only one of the first experiments."""
 CONTROLLERS = ("hold", "rest", "scripted", "policy")
@@ -242,7 +244,7 @@ def load_experiment(path: str | Path) -> Experiment:
     plain = to_table(of.config)
     plain |= {"scene": ""} if "scene" in plain else {}
     task = task_config(of, merged(plain, with_present_names(of.config, given)), where)
-    table["phases"] = _with_arms(table.get("phases"), of.agents)
+    table["phases"] = _with_arms(table.get("phases"), of.agents, where / "phases")
     _rename(table, "drivers", "controllers", where)
     for i, case in enumerate(cases if isinstance(cases := table.get("cases"), list) else []):
         if isinstance(case, dict):
@@ -261,10 +263,16 @@ def _rename(table: dict, former: str, present: str, where: Where) -> None:
     table[present] = table.pop(former)
 
 
-def _with_arms(phases: Any, agents: tuple[str, ...]) -> Any:
+def _with_arms(phases: Any, agents: tuple[str, ...], where: Where) -> Any:
     """The tables of phases with the controllers of all arms, in their order, under `arms`."""
     if not isinstance(phases, list):
         return [] if phases is None else phases
+    fields = [each.name for each in dataclasses.fields(Phase) if each.name != "arms"]
+    for i, phase in enumerate(phases):
+        for name in phase if isinstance(phase, dict) else ():
+            if name not in (*fields, *agents):
+                known = f"an arm ({', '.join(agents)}) or one of {', '.join(fields)}"
+                raise (where / i / name).error("unknown field", known)
     return [
         {name: value for name, value in phase.items() if name not in agents}
         | {"arms": [[agent, phase.get(agent, "hold")] for agent in agents]}
@@ -404,6 +412,14 @@ def _check_whole(spec: Experiment, where: Where) -> None:
         if phase.until not in conditions:
             raise (where / "phases" / i / "until").error(
                 f"got '{phase.until}'", f"one of {', '.join(conditions)}"
+            )
+        if phase.name in TIMED:
+            raise (where / "phases" / i / "name").error(
+                f"got '{phase.name}'", f"another name: '{phase.name}_s' is a column of the results"
+            )
+        if phase.hold_s > phase.timeout_s:
+            raise (where / "phases" / i / "hold_s").error(
+                f"got {phase.hold_s:g} s", f"at most timeout_s, {phase.timeout_s:g} s"
             )
         for arm, controller in phase.arms:
             if controller not in (*CONTROLLERS, *defined):

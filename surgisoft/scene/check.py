@@ -121,7 +121,7 @@ def sentence(check: SceneCheck) -> str:
             if work.views
             else "",
             f"{_each('plain tip', work.touches)} reaches the lesion" if work.touches else "",
-            f"nothing comes closer than {work.clearance_mm.min():.1f} mm",
+            f"nothing comes closer than {work.clearance_mm.min():.1f} mm at work",
         ]
         return f"The scene is ready: {', '.join(part for part in parts if part)}."
     bad = [f"{f.what}: {f.value} (needs {f.wanted})" for f in check.findings if not f.good]

@@ -10,6 +10,7 @@ from torch import Tensor
 from surgisoft.errors import InputError
 from surgisoft.tasks.path_following import FOLLOW_PRESET, FOLLOW_STEPS, Follow, FollowConfig
 from surgisoft.tasks.spec import TaskSpec
+from surgisoft.tasks.supervision import UNENDING
 from surgisoft.tasks.track import level_world, points_at_start
 from surgisoft.tasks.world.arm import Arm
 from surgisoft.tasks.world.world import WorldConfig
@@ -50,7 +51,9 @@ def laser_plane(
     return Follow("laser_plane", world, config.follow, spot, spot(start)[0], directions=2)
 
 
-LASER_PLANE = TaskSpec(laser_plane, LaserPlaneConfig(), ("arm",), FOLLOW_PRESET, FOLLOW_STEPS)
+LASER_PLANE = TaskSpec(
+    laser_plane, LaserPlaneConfig(), ("arm",), FOLLOW_PRESET, FOLLOW_STEPS, UNENDING
+)
 
 
 @dataclass(frozen=True, eq=False)

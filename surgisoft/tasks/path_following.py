@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError, unknown_name
-from surgisoft.tasks.base import TaskState, check_weights, weighted
+from surgisoft.tasks.base import Task, TaskState, check_weights, weighted
 from surgisoft.tasks.inverse_kinematics import action_towards, least_squares
 from surgisoft.tasks.observations import (
     Block,
@@ -337,3 +337,18 @@ class Follow:
         """(B, 3) mm: the true point that follows."""
         part = state.world.arms["arm"]
         return self.marker(part.points_mm, part.mount)
+
+
+def beyond_reach(task: Task) -> str:
+    """How much of a task's path its arm cannot reach, in words; empty where it reaches all."""
+    if not isinstance(task, Follow):
+        return ""
+    off = task.out_of_reach_mm()
+    beyond = off > REACHED_MM
+    if not beyond.any():
+        return ""
+    return (
+        f"{100 * float(beyond.float().mean()):.0f} % of the path of {task.name} is out of the "
+        f"arm's reach, by up to {float(off.max()):.2f} mm (mean over the path "
+        f"{float(off.mean()):.2f} mm)"
+    )

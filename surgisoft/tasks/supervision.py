@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from surgisoft.errors import InputError
 from surgisoft.tasks.base import Task, TaskState
 from surgisoft.tasks.inverse_kinematics import Pointing
 
@@ -119,7 +120,12 @@ def _never(task: Task, state: TaskState, within: float) -> Tensor:
 
 def _succeeded(task: Task, state: TaskState, within: float) -> Tensor:
     values = task.measures(state)
-    return values["success"] >= within if "success" in values else _never(task, state, within)
+    if "success" not in values:
+        raise InputError(
+            f"until = 'succeeded': {task.name} has no measure of success, expected another "
+            "condition, such as 'never'"
+        )
+    return values["success"] >= within
 
 
 def _at_rest(task: Task, state: TaskState, within: float) -> Tensor:
@@ -177,3 +183,5 @@ class ExperimentTask:
 
 BEAMLESS = ExperimentTask()
 """Experiments of a task without a beam."""
+UNENDING = ExperimentTask(conditions={"at rest": AT_REST, "never": NEVER})
+"""Experiments of a task that has no measure of success either."""

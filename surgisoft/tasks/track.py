@@ -10,6 +10,7 @@ from torch import Tensor
 
 from surgisoft.tasks.path_following import FOLLOW_PRESET, FOLLOW_STEPS, Follow, FollowConfig
 from surgisoft.tasks.spec import TaskSpec
+from surgisoft.tasks.supervision import UNENDING
 from surgisoft.tasks.world.arm import Randomisation
 from surgisoft.tasks.world.random_streams import streams
 from surgisoft.tasks.world.world import World, WorldConfig, named_arm, single_arm_world
@@ -41,8 +42,10 @@ def track_square(config: TrackConfig | None = None, device: str | torch.device =
     return _track("track_square", config or SQUARE, device)
 
 
-TRACK_CIRCLE = TaskSpec(track_circle, TrackConfig(), ("arm",), FOLLOW_PRESET, FOLLOW_STEPS)
-TRACK_SQUARE = TaskSpec(track_square, SQUARE, ("arm",), FOLLOW_PRESET, FOLLOW_STEPS)
+TRACK_CIRCLE = TaskSpec(
+    track_circle, TrackConfig(), ("arm",), FOLLOW_PRESET, FOLLOW_STEPS, UNENDING
+)
+TRACK_SQUARE = TaskSpec(track_square, SQUARE, ("arm",), FOLLOW_PRESET, FOLLOW_STEPS, UNENDING)
 
 
 def tip(points_mm: Tensor, mount: Tensor | None = None) -> Tensor:

@@ -24,6 +24,7 @@ from surgisoft.tasks.observations import (
 )
 from surgisoft.tasks.path_following import FOLLOW_PRESET, FOLLOW_STEPS
 from surgisoft.tasks.spec import TaskSpec
+from surgisoft.tasks.supervision import UNENDING
 from surgisoft.tasks.track import level_world
 from surgisoft.tasks.world.arm import Arm
 from surgisoft.tasks.world.random_streams import Stream
@@ -186,6 +187,4 @@ class TrackBody:
         return {"arm": action_towards(self.arm, part, target, error, self.dt_s, STUCK_MM)}
 
 
-TRACK_BODY = TaskSpec(
-    TrackBody, TrackBodyConfig(), ("arm",), preset=FOLLOW_PRESET, training_steps=FOLLOW_STEPS
-)
+TRACK_BODY = TaskSpec(TrackBody, TrackBodyConfig(), ("arm",), FOLLOW_PRESET, FOLLOW_STEPS, UNENDING)

@@ -157,6 +157,16 @@ def test_a_short_training_says_why_it_did_not_come_far(packaged):
     assert "no error could be measured in its evaluations" in said(error_mm=float("nan"))
 
 
+def test_no_longer_training_is_advised_where_the_path_is_out_of_reach(packaged, monkeypatch):
+    far = track_circle(TrackConfig(FollowConfig(size_mm=500.0)))
+    monkeypatch.setattr("surgisoft.agents.run_folder.RunFolder.task", lambda self: far)
+    best = {"error_mm": 250.0}
+    told = shortfall(TrainedRun(packaged, Result(True, 100, 1.0, 1.0, best), True))
+    assert "% of the path of track_circle is out of the arm's reach" in told
+    assert "make the path smaller (size_mm) or move its centre" in told
+    assert "train longer" not in told
+
+
 def test_a_logger_needs_its_library(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match="wandb is not installed; pip install wandb"):

@@ -66,6 +66,17 @@ def test_the_interlock_lets_the_beam_on_only_when_all_is_well(cutting):
         assert not task.released(replace(state, goal=replace(state.goal, **change))).any()
 
 
+def test_the_beam_is_aimed_in_phases_that_permit_it(cutting):
+    """On the way to rest the distance of its axis from a target is no error of aiming."""
+    task, state = cutting
+    late = replace(state, world=replace(state.world, steps=state.world.steps + 100))
+    true_mm = task.base.measures(task.plain(late))["pointing_error_mm"]
+    assert true_mm.isfinite().all()
+    assert torch.equal(task.measures(late)["pointing_error_mm"], true_mm)
+    idle = replace(late, goal=replace(late.goal, phase=late.goal.phase - 1))
+    assert task.measures(idle)["pointing_error_mm"].isnan().all()
+
+
 def test_an_experiment_cannot_loosen_the_scene_s_clearance(cutting, spec, base):
     loose = replace(spec, limits=replace(spec.limits, clearance_mm=-5.0))
     assert PhasedTask(LaserSupervision(base), loose).clear_mm == base.spec.limits.clearance_mm

@@ -280,7 +280,8 @@ def test_a_task_without_a_scene_makes_an_experiment(name, tmp_path, capsys):
     assert run(["experiment", "run", str(file), "-o", str(tmp_path / "r"), "--no-replays"]) == 0
     (row,) = _rows(tmp_path / "r")
     assert row["outcome"] == "time out"
-    assert row["go_s"] + row["wait_s"] == pytest.approx(0.6)
+    assert row["go_s"] == pytest.approx(0.3), "the steps that ran in it"
+    assert row["wait_s"] == pytest.approx(0.3)
     assert row["beam_s"] == 0.0
     page = (tmp_path / "r" / "report.html").read_text()
     assert "chamber 1 goes to 0 kPa from 0.4 s on" in page
@@ -288,3 +289,18 @@ def test_a_task_without_a_scene_makes_an_experiment(name, tmp_path, capsys):
     capsys.readouterr()
     assert run(["experiment", "check", str(file)]) == 2
     assert f":1: scene: got '.'; expected none: {name} has no scene" in capsys.readouterr().err
+
+
+def test_a_fault_that_never_came_is_said_to_have_not(tmp_path, capsys):
+    """And a task without a measure of success has no condition that waits for it."""
+    file = tmp_path / "late.toml"
+    phase = '[[phases]]\nname = "go"\ntimeout_s = 0.3\non_timeout = "go on"\narm = "policy"\n'
+    late = '[[faults]]\narm = "arm"\nchamber = 1\nat_s = 300.0\n'
+    file.write_text(f'name = "late"\nscenario = "track_circle"\n{phase}{late}')
+    assert run(["experiment", "run", str(file), "-o", str(tmp_path / "r"), "--no-replays"]) == 0
+    printed = capsys.readouterr().out
+    assert "No episode lasted until the fault at 300 s" in printed
+    assert "After the fault" not in printed
+    file.write_text(file.read_text().replace("on_timeout", 'until = "succeeded"\non_timeout'))
+    assert run(["experiment", "check", str(file)]) == 2
+    assert "got 'succeeded'; expected one of at rest, never" in capsys.readouterr().err

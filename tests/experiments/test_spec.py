@@ -41,6 +41,14 @@ BAD = {
     'laser = "policy"': ('laser = "pilot"', "phases[1].laser", "one of hold, rest"),
     'name = "cut"': ('name = "look"', "phases[1].name", "names that differ"),
     'scene = "{scene}"': ('scene = "nowhere"', "scene", "a scene's folder"),
+    "beam = true": (
+        'lazer = "rest"',
+        "phases[1].lazer",
+        "an arm (laser, endoscope) or one of name",
+    ),
+    'until = "cut"': ('arms = "policy"', "phases[1].arms", "an arm (laser, endoscope) or one of"),
+    "timeout_s = 30.0": ("timeout_s = 3.0\nhold_s = 4.0", "phases[1].hold_s", "at most timeout_s"),
+    '"look"': ('"time"', "phases[0].name", "'time_s' is a column of the results"),
     "time_s = 0.5": ('time_s = 0.5\nretreat = "out"', "limits.retreat", "one of the phases"),
 }
 

@@ -76,10 +76,11 @@ def open_policy(name: str, task: Task) -> Policy:
 
 def check_policy(name: str) -> None:
     """Raise InputError unless the name is that of a policy or a path that exists."""
-    from surgisoft.agents.run_folder import run_path
+    from surgisoft.agents.run_folder import packaged_runs, run_path
 
     if name in POLICIES or run_path(name).exists():
         return
     if Path(name).name == name:
-        raise unknown_name("policy", name, [*POLICIES, "the folder of a training run"])
+        known = [*POLICIES, *packaged_runs(), "the folder of a training run"]
+        raise unknown_name("policy", name, known)
     raise InputError(f"{name}: no such folder; expected a training run, scripted or random")

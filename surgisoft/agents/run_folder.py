@@ -91,6 +91,11 @@ def run_path(path: str | Path) -> Path:
     return PACKAGED / path if named and (PACKAGED / path / "config.json").is_file() else path
 
 
+def packaged_runs() -> list[str]:
+    """Names of the runs that the package brings along."""
+    return sorted(config.parent.name for config in PACKAGED.glob("*/config.json"))
+
+
 def default_folder(task: str) -> Path:
     """A free `runs/TASK-DATE-TIME`."""
     base = Path("runs") / f"{task}-{datetime.now():%Y%m%d-%H%M%S}"

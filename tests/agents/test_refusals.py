@@ -22,6 +22,7 @@ from surgisoft.agents.learned import check_fits
 from surgisoft.agents.loggers import LoggerFailed, check_logger, open_writer
 from surgisoft.agents.observer import ObserverGains
 from surgisoft.agents.on_rig import RigConfig, on_rig
+from surgisoft.agents.policies import check_policy
 from surgisoft.agents.presets import Plan, Preset
 from surgisoft.agents.run_folder import PACKAGED, RunFolder, check_free
 from surgisoft.agents.session import EvaluationRequest, evaluate
@@ -165,6 +166,13 @@ def test_no_longer_training_is_advised_where_the_path_is_out_of_reach(packaged, 
     assert "% of the path of track_circle is out of the arm's reach" in told
     assert "make the path smaller (size_mm) or move its centre" in told
     assert "train longer" not in told
+
+
+def test_an_unknown_policy_names_those_of_the_package():
+    with pytest.raises(
+        InputError, match=r"known are random, ring, scripted, .*did you mean 'ring'"
+    ):
+        check_policy("rung")
 
 
 def test_a_logger_needs_its_library(monkeypatch):

@@ -169,9 +169,7 @@ def test_no_longer_training_is_advised_where_the_path_is_out_of_reach(packaged, 
 
 
 def test_an_unknown_policy_names_those_of_the_package():
-    with pytest.raises(
-        InputError, match=r"known are random, ring, .*did you mean 'ring'"
-    ):
+    with pytest.raises(InputError, match=r"known are random, ring, .*did you mean 'ring'"):
         check_policy("rung")
 
 

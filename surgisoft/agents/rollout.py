@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -171,7 +172,9 @@ def _rolled_out(
         watch(Instant(first + at, state, None, None, live))
     for step in range(task.steps):
         shapes = {agent: (len(live), size) for agent, size in sizes.items()}
-        actions = actions_of(policy.act(task, state, runner.observe(state)), shapes, device)
+        acted = policy.act(task, state, runner.observe(state))
+        # What it does with arms without an agent goes along.
+        actions = {**actions_of(acted, shapes, device), **_beside(acted, shapes)}
         state, outcome = runner.step(state, actions)
         if watch:
             watch(Instant(first + at, state, actions, outcome, live))
@@ -197,6 +200,11 @@ def _rolled_out(
     measures = {n: _padded(one, task.steps) for n, one in zip(names, whole, strict=True)}
     dt_s = task.world.config.dt_s
     return Rollout(task.name, dt_s, steps, returns, terminated, failed, measures)
+
+
+def _beside(actions: Mapping[str, Tensor], agents: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Actions of arms that are no agents."""
+    return {name: action for name, action in actions.items() if name not in agents}
 
 
 def _padded(values: Tensor, length: int) -> Tensor:

@@ -163,7 +163,7 @@ def test_each_laser_has_its_own_power_and_an_arm_without_agent_holds_still(scene
     now = bool(after.scene.hits["laser_1"].on_organ)
     assert joules.tolist() == pytest.approx([0.7 * 0.5 * (on[0] + now), 0.0])
     assert not torch.equal(after.scene.hits["laser_1"].point_mm, ends["laser_1"])
-    with pytest.raises(KeyError):
+    with pytest.raises(InputError, match="no action for 'endoscope'"):
         world.step(state, {"laser_1": actions["laser_1"]})
     with pytest.raises(
         InputError, match="has the arms laser_1, laser_2, endoscope, expected laser,"

@@ -201,7 +201,7 @@ def test_wrong_use_is_one_line():
     with pytest.raises(InputError, match="step before reset"):
         env.step({})
     env.reset()
-    with pytest.raises(InputError, match="no action for 'arm'"):
+    with pytest.raises(InputError, match="no action for arm"):
         env.step({"laser": np.zeros(3)})
     with pytest.raises(InputError, match=r"shape \(1, 2\), expected \(1, 3\)"):
         env.step({"arm": np.zeros(2)})

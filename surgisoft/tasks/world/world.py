@@ -227,7 +227,7 @@ class World:
 def _action(actions: Mapping[str, Tensor], name: str, part: ArmPart) -> Tensor:
     """An arm's action. The compiled loops of a step read as many numbers as it has to have."""
     if name not in actions:
-        raise InputError(f"no action for '{name}', expected one for each arm")
+        raise InputError(f"no action for '{name}', expected one for each arm that an agent drives")
     action, expected = actions[name], part.command.shape
     if action.shape != expected:
         raise InputError(

@@ -418,7 +418,7 @@ def _where(mask: Tensor, yes: Any, no: Any) -> Any:
 
     def pick(a: Tensor, b: Tensor) -> Tensor:
         this = mask.view(-1, *[1] * (a.ndim - 1))
-        if a.dtype == torch.bool:  # onnxruntime has no Where of truth values
+        if a.dtype == torch.bool:  # onnxruntime implements no Where of booleans
             return (this & a) | (~this & b)
         return torch.where(this, a, b)
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -172,9 +171,9 @@ def _rolled_out(
         watch(Instant(first + at, state, None, None, live))
     for step in range(task.steps):
         shapes = {agent: (len(live), size) for agent, size in sizes.items()}
-        acted = policy.act(task, state, runner.observe(state))
-        # What it does with arms without an agent goes along.
-        actions = {**actions_of(acted, shapes, device), **_beside(acted, shapes)}
+        given = policy.act(task, state, runner.observe(state))
+        checked = actions_of(given, shapes, device)
+        actions = {**given, **checked}  # it may also move arms that no agent drives
         state, outcome = runner.step(state, actions)
         if watch:
             watch(Instant(first + at, state, actions, outcome, live))
@@ -200,11 +199,6 @@ def _rolled_out(
     measures = {n: _padded(one, task.steps) for n, one in zip(names, whole, strict=True)}
     dt_s = task.world.config.dt_s
     return Rollout(task.name, dt_s, steps, returns, terminated, failed, measures)
-
-
-def _beside(actions: Mapping[str, Tensor], agents: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Actions of arms that are no agents."""
-    return {name: action for name, action in actions.items() if name not in agents}
 
 
 def _padded(values: Tensor, length: int) -> Tensor:

@@ -64,7 +64,7 @@ def verdict(results: Results) -> str:
     unsafe = max(row["beam_unsafe_longest_s"] for row in results.rows)
     hits = sum(row.get("collided", 0.0) > 0.0 for row in results.rows)
     each = "; ".join(f"{s.label.replace('_', ' ')}: {_one(s)}" for s in settings)
-    if faults and not any(_broke(results, row) for row in results.rows):
+    if faults and not any(_fault_came(results, row) for row in results.rows):
         first = f"No episode lasted until the fault at {min(f.at_s for f in faults):g} s"
         first += f"; {each}" if len(settings) <= SHOWN else ""
     elif faults:
@@ -93,7 +93,7 @@ def verdict(results: Results) -> str:
     return f"{first}.{last}{safe}"
 
 
-def _broke(results: Results, row: Row) -> bool:
+def _fault_came(results: Results, row: Row) -> bool:
     """Whether a fault came before the end of an episode."""
     return row["time_s"] > min(fault.at_s for fault in results.experiment.faults)
 

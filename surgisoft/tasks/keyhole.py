@@ -155,7 +155,7 @@ class Keyhole:
         state = replace(state, world=self.world.step(state.world, actions))
         near = self.error_mm(state) <= self.config.reach_mm
         if at_target is not None:
-            # No torch.where: onnxruntime has none of truth values.
+            # In place of torch.where: onnxruntime implements no Where of booleans.
             near = (near & at_target.isnan()) | (at_target > 0.5)
         near = near & ~self.ended(state)
         reached = (state.goal.reached + near).clamp(max=self.config.visits)

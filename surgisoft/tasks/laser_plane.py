@@ -10,7 +10,7 @@ from torch import Tensor
 from surgisoft.errors import InputError
 from surgisoft.tasks.path_following import FOLLOW_PRESET, FOLLOW_STEPS, Follow, FollowConfig
 from surgisoft.tasks.spec import TaskSpec
-from surgisoft.tasks.supervision import UNENDING
+from surgisoft.tasks.supervision import WITHOUT_SUCCESS
 from surgisoft.tasks.track import level_world, points_at_start
 from surgisoft.tasks.world.arm import Arm
 from surgisoft.tasks.world.world import WorldConfig
@@ -52,7 +52,7 @@ def laser_plane(
 
 
 LASER_PLANE = TaskSpec(
-    laser_plane, LaserPlaneConfig(), ("arm",), FOLLOW_PRESET, FOLLOW_STEPS, UNENDING
+    laser_plane, LaserPlaneConfig(), ("arm",), FOLLOW_PRESET, FOLLOW_STEPS, WITHOUT_SUCCESS
 )
 
 

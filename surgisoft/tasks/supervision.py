@@ -183,5 +183,5 @@ class ExperimentTask:
 
 BEAMLESS = ExperimentTask()
 """Experiments of a task without a beam."""
-UNENDING = ExperimentTask(conditions={"at rest": AT_REST, "never": NEVER})
+WITHOUT_SUCCESS = ExperimentTask(conditions={"at rest": AT_REST, "never": NEVER})
 """Experiments of a task that has no measure of success either."""

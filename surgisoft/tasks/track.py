@@ -10,7 +10,7 @@ from torch import Tensor
 
 from surgisoft.tasks.path_following import FOLLOW_PRESET, FOLLOW_STEPS, Follow, FollowConfig
 from surgisoft.tasks.spec import TaskSpec
-from surgisoft.tasks.supervision import UNENDING
+from surgisoft.tasks.supervision import WITHOUT_SUCCESS
 from surgisoft.tasks.world.arm import Randomisation
 from surgisoft.tasks.world.random_streams import streams
 from surgisoft.tasks.world.world import World, WorldConfig, named_arm, single_arm_world
@@ -43,9 +43,11 @@ def track_square(config: TrackConfig | None = None, device: str | torch.device =
 
 
 TRACK_CIRCLE = TaskSpec(
-    track_circle, TrackConfig(), ("arm",), FOLLOW_PRESET, FOLLOW_STEPS, UNENDING
+    track_circle, TrackConfig(), ("arm",), FOLLOW_PRESET, FOLLOW_STEPS, WITHOUT_SUCCESS
 )
-TRACK_SQUARE = TaskSpec(track_square, SQUARE, ("arm",), FOLLOW_PRESET, FOLLOW_STEPS, UNENDING)
+TRACK_SQUARE = TaskSpec(
+    track_square, SQUARE, ("arm",), FOLLOW_PRESET, FOLLOW_STEPS, WITHOUT_SUCCESS
+)
 
 
 def tip(points_mm: Tensor, mount: Tensor | None = None) -> Tensor:

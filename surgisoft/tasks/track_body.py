@@ -24,7 +24,7 @@ from surgisoft.tasks.observations import (
 )
 from surgisoft.tasks.path_following import FOLLOW_PRESET, FOLLOW_STEPS
 from surgisoft.tasks.spec import TaskSpec
-from surgisoft.tasks.supervision import UNENDING
+from surgisoft.tasks.supervision import WITHOUT_SUCCESS
 from surgisoft.tasks.track import level_world
 from surgisoft.tasks.world.arm import Arm
 from surgisoft.tasks.world.random_streams import Stream
@@ -187,4 +187,6 @@ class TrackBody:
         return {"arm": action_towards(self.arm, part, target, error, self.dt_s, STUCK_MM)}
 
 
-TRACK_BODY = TaskSpec(TrackBody, TrackBodyConfig(), ("arm",), FOLLOW_PRESET, FOLLOW_STEPS, UNENDING)
+TRACK_BODY = TaskSpec(
+    TrackBody, TrackBodyConfig(), ("arm",), FOLLOW_PRESET, FOLLOW_STEPS, WITHOUT_SUCCESS
+)

@@ -148,8 +148,8 @@ def test_the_reference_evaluator_of_onnx_runs_the_file_too(policy, exported):
     assert found.commands_kPa < AGREE_KPA
 
 
-class NoChoiceOfTruths(TorchDispatchMode):
-    """Fails where an operation chooses among truth values: onnxruntime has no such operator."""
+class NoBooleanWhere(TorchDispatchMode):
+    """Fails at a `where` of booleans, which onnxruntime does not implement."""
 
     def __torch_dispatch__(self, operation, types, given=(), options=None):
         if operation.overloadpacket is torch.ops.aten.where and len(given) == 3:
@@ -177,7 +177,7 @@ def test_the_controller_of_every_task_does_on_the_rig_what_evaluate_does(name):
         for agent, size in agent_sizes(task).items()
     }
     graph = ControllerGraph(task, actors)
-    with NoChoiceOfTruths(), torch.no_grad():
+    with NoBooleanWhere(), torch.no_grad():
         graph(*graph.example())
     found = check_on_rig(running(graph), task, ActorPolicy(actors), STRANGE, seed=3)
     assert found.decisions == DECISIONS

@@ -21,7 +21,7 @@ from scipy.stats import binomtest
 
 from benchmarks.cache import Cache
 from benchmarks.robust_floor import Floor, floor
-from surgisoft.agents.evaluate import bootstrap, evaluate
+from surgisoft.agents.evaluate import evaluate, student
 from surgisoft.agents.on_rig import RigConfig, named_rig, on_rig
 from surgisoft.agents.policies import open_policy
 from surgisoft.agents.run_folder import RunFolder
@@ -360,11 +360,11 @@ def _rate(flags: Sequence[bool]) -> str:
 
 
 def _mean(values: Sequence[float]) -> str:
-    """Mean with its 95 % interval, by bootstrap over the robots."""
+    """Mean with its 95 % interval, Student's (1908) over the robots."""
     known = np.array([value for value in values if np.isfinite(value)])
     if len(known) < 2:
         return f"{known.mean():.3f}" if len(known) else "-"
-    low, high = bootstrap(known)
+    low, high = student(known)
     return f"{known.mean():.3f} ({low:.3f} to {high:.3f})"
 
 
@@ -386,7 +386,7 @@ def markdown(rows: list[Row], floors: list[Floor], study: Study) -> str:
         f"constant. Before an episode each arm goes through {study.poses} random pressures, 4 s "
         "each. Errors are true ones; "
         f"{'FCL' if study.exact else 'the engine of training'} decides about contact. Rates with "
-        "Wilson's 95 % interval, means with a bootstrap over the robots.",
+        "Wilson's 95 % interval, means with Student's over the robots.",
         "",
         "| policy, observer | arm model | ring cut | beam error, mm | pointing error, mm "
         "| its 95 % quantile, mm | contact | time, share |",

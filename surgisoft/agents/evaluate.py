@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 import torch
-from scipy.special import ndtri
+from scipy.special import ndtri, stdtrit
 from torch import Tensor
 
 from surgisoft.agents.exact_checks import EpisodeCheck, ExactChecks, contacts_in, has_obstacles
@@ -19,8 +19,6 @@ from surgisoft.progress import Progress, silent
 from surgisoft.tasks.base import Task
 from surgisoft.tasks.world.scene import SceneEngine
 
-RESAMPLES = 2000
-"""Bootstrap resamples of an interval."""
 CONFIDENCE = 0.95
 """Confidence level of the intervals."""
 
@@ -35,6 +33,8 @@ SUMMARIES: dict[str, Callable[[Rollout, str], Tensor]] = {
 """Measure -> how an episode is summarised; errors have four summaries, others the mean."""
 RATES = ("success", "collided", "failed")
 """Numbers of an episode that are 0 or 1: their mean is a rate."""
+SHARES = ("completion", "view_fraction", "in_view", "visited")
+"""Numbers of an episode from 0 to 1: an interval of their mean ends there."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,9 @@ class Summary:
     mean: float
     """Mean over the episodes where it applies; nan where it applies to none."""
     low: float
-    """Lower end of the 95 % interval of the mean."""
+    """Lower end of the 95 % interval of the mean; nan where one episode has none."""
     high: float
-    """Upper end of the 95 % interval of the mean."""
+    """Upper end of the 95 % interval of the mean; nan where one episode has none."""
     least: float
     """Smallest of all episodes."""
     most: float
@@ -148,7 +148,7 @@ def summarised(
     checks = exactly.checks(result.episodes) if exactly else None
     table = episode_table(task, result, checks)
     table = {key: values for key, values in table.items() if key not in without}
-    overall = {key: summary(values, key in RATES) for key, values in table.items()}
+    overall = {key: summary(key, values) for key, values in table.items()}
     return Evaluation(name, table, overall, checks)
 
 
@@ -190,15 +190,20 @@ def _in_view(task: Task, result: Rollout) -> Tensor:
     return enough.where(seen.isfinite(), seen).nanmean(1)
 
 
-def summary(values: np.ndarray, rate: bool = False) -> Summary:
-    """Mean of (N,) numbers with its interval: Wilson's (1927) for a rate, else by bootstrap."""
+def summary(name: str, values: np.ndarray) -> Summary:
+    """Mean of (N,) numbers of that name with its interval.
+
+    Wilson's (1927) for a rate, else Student's (1908), which ends at 0 and 1 for a share.
+    """
     known = values[np.isfinite(values)]
     if not len(known):
         return Summary(*(math.nan,) * 5, 0)
-    if rate:
+    if name in RATES:
         low, high = wilson(round(known.sum()), len(known))
     else:
-        low, high = bootstrap(known)
+        low, high = student(known)
+        if name in SHARES:
+            low, high = max(low, 0.0), min(high, 1.0)
     ends = (float(known.min()), float(known.max()))
     return Summary(float(known.mean()), float(low), float(high), *ends, len(known))
 
@@ -215,13 +220,28 @@ def wilson(hits: int, count: int) -> tuple[float, float]:
     return 0.0 if not hits else middle - half, 1.0 if hits == count else middle + half
 
 
-def bootstrap(values: np.ndarray) -> tuple[float, float]:
-    """Ends of the 95 % interval of the mean of (N,) numbers: percentiles (Efron 1979)."""
-    draw = np.random.default_rng(0).integers(len(values), size=(RESAMPLES, len(values)))
-    means = values[draw].mean(axis=1)
-    tail = 50.0 * (1.0 - CONFIDENCE)
-    low, high = np.percentile(means, [tail, 100.0 - tail])
-    return float(low), float(high)
+def student(values: np.ndarray) -> tuple[float, float]:
+    """Ends of the 95 % interval of the mean of (N,) numbers; nan for one number, which has none.
+
+    Student 1908: the mean and N - 1 degrees of freedom. It is as wide as few episodes require;
+    percentiles of a bootstrap (Efron 1979) hold the mean of two numbers half the time.
+    """
+    if len(values) < 2:
+        return math.nan, math.nan
+    mean, error = float(values.mean()), float(values.std(ddof=1)) / math.sqrt(len(values))
+    half = float(stdtrit(len(values) - 1, (1.0 + CONFIDENCE) / 2.0)) * error
+    return mean - half, mean + half
+
+
+def cell(name: str, value: Summary | None) -> str:
+    """A mean with its interval in brackets; without one where all episodes have the same number."""
+    if value is None or not value.episodes:
+        return "-"
+    if name in RATES:
+        return f"{value.mean:.1%} [{value.low:.1%}, {value.high:.1%}]"
+    if value.least == value.most:
+        return f"{value.mean:.4g}"
+    return f"{value.mean:.4g} [{value.low:.4g}, {value.high:.4g}]"
 
 
 def _contact(check: EpisodeCheck) -> dict | None:

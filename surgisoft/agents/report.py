@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from surgisoft.agents.evaluate import RATES, Evaluation, Summary
+from surgisoft.agents.evaluate import RATES, Evaluation, Summary, cell
 from surgisoft.agents.report_charts import episode_charts, spread_chart
 from surgisoft.errors import counted
 from surgisoft.report import Facts, Gallery, Page, Picture, Section, Table, Text
@@ -21,7 +21,7 @@ WORDS = {
 UNITS = {"_mm": "mm", "_mm2": "mm²", "_s": "s"}
 """Unit of a number by the end of its name."""
 HOW = (
-    "Means are over episodes, with 95 % intervals in brackets: Wilson's for rates, by bootstrap "
+    "Means are over episodes, with 95 % intervals in brackets: Wilson's for rates, Student's "
     "for all else. The beam's error is the distance of its axis from its target while it is on. "
     "Clearance, contact and success come from exact collision checks (FCL) where there is a scene."
 )
@@ -39,7 +39,7 @@ def evaluation_page(
     films = films or {}
     names = list(dict.fromkeys(name for result in results for name in result.overall))
     rows = [
-        (in_words(name), *(cell(result.overall.get(name), name in RATES) for result in results))
+        (in_words(name), *(cell(name, result.overall.get(name)) for result in results))
         for name in names
     ]
     header = ["mean [95 % interval]", *(Path(result.policy).name for result in results)]
@@ -113,17 +113,6 @@ def verdict(task: str, results: Sequence[Evaluation]) -> str:
     if len(set(counts)) > 1:
         episodes = f"{' and '.join(map(str, counts))} episodes"
     return f"Task {task}, {episodes}. {'; '.join(parts)}."
-
-
-def cell(value: Summary | None, rate: bool) -> str:
-    """A mean with its interval."""
-    if value is None or not value.episodes:
-        return "-"
-    if rate:
-        return f"{value.mean:.1%} [{value.low:.1%}, {value.high:.1%}]"
-    if value.least == value.most:
-        return f"{value.mean:.4g}"
-    return f"{value.mean:.4g} [{value.low:.4g}, {value.high:.4g}]"
 
 
 def _error(result: Evaluation) -> Summary | None:

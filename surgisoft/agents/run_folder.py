@@ -31,7 +31,7 @@ from surgisoft.scene.folder import open_scene
 from surgisoft.scene.spec import FILE, arm_names
 from surgisoft.surrogate.checkpoint import save_model
 from surgisoft.tasks.base import Task
-from surgisoft.tasks.registry import config_from, make_task, with_fields
+from surgisoft.tasks.registry import config_from, make_task, package_of, task_names, with_fields
 
 FORMAT = 1
 """Version of the folder's layout."""
@@ -130,6 +130,7 @@ def create_run(folder: Path, plan: Plan, task: Task, agents: dict, processes: in
             "versions": versions(),
             "started": datetime.now().isoformat(timespec="seconds"),
             "task": plan.task,
+            "task_package": package_of(plan.task),
             "task_config": to_table(plan.task_config),
             "scene": scene,
             "arms": {
@@ -220,10 +221,21 @@ class RunFolder:
         )
 
     def _task_config(self):
+        self._check_task()
         config = config_from(self.config["task"], self.config["task_config"], self._file)
         if self.config["scene"]:
             return with_fields(config, scene=str(self.path / "scene"), arm=None)
         return with_fields(config, arm=str(self.path / "arms" / "arm"))
+
+    def _check_task(self) -> None:
+        """Raise InputError where the package that offers the run's task is not installed."""
+        name = self.config["task"]
+        if name not in task_names():
+            package = self.config.get("task_package") or "the package that offers it"
+            raise InputError(
+                f"{self.path}: was trained on the task '{name}', which is not installed here; "
+                f"install {package} first"
+            )
 
     @property
     def _file(self) -> Path:

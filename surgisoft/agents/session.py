@@ -265,7 +265,7 @@ def evaluate(
     """Evaluate policies on the same episodes of a task, with 95 % intervals.
 
     Returns, for each policy, the mean of every measure (mm, s, or a share 0..1, as its name states)
-    with its interval: Wilson's (1927) for rates, by bootstrap over episodes for others. Raises
+    with its interval: Wilson's (1927) for rates, Student's (1908) over episodes for others. Raises
     InputError for an unknown task, and for a run that was trained on other observations.
 
     policies: `scripted` (inverse kinematics with privileged information), `random`, or folders of

@@ -214,12 +214,12 @@ def _rig_config(
 
 
 def _show(results) -> None:
-    from surgisoft.agents.evaluate import RATES
+    from surgisoft.agents.evaluate import cell
 
     names = list(dict.fromkeys(name for result in results for name in result.overall))
     rows = [["", *(Path(result.policy).name for result in results)]]
     for name in names:
-        cells = (_cell(result.overall.get(name), name in RATES) for result in results)
+        cells = (cell(name, result.overall.get(name)) for result in results)
         rows.append([name, *cells])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for first, *values in rows:
@@ -236,11 +236,3 @@ def _show(results) -> None:
                 f"mm; FCL was asked about contact in {facts['contact_asked']} and about the beam "
                 f"in {facts['beams_asked']}, in the others it cannot differ"
             )
-
-
-def _cell(value, rate: bool) -> str:
-    if value is None or not value.episodes:
-        return "-"
-    if rate:
-        return f"{value.mean:.1%} [{value.low:.1%}, {value.high:.1%}]"
-    return f"{value.mean:.4g} [{value.low:.4g}, {value.high:.4g}]"

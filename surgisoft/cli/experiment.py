@@ -1,7 +1,9 @@
 """`surgisoft experiment`: run scripted experiments on a scene, from a TOML file to a report."""
 
+from __future__ import annotations
+
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -19,6 +21,9 @@ from surgisoft.cli.options import (
 )
 from surgisoft.cli.progress import progress
 from surgisoft.errors import counted
+
+if TYPE_CHECKING:
+    from surgisoft.experiments.spec import Limits
 
 commands = typer.Typer(
     no_args_is_help=True, help="Scripted experiments on a scene: run, check, list."
@@ -121,7 +126,7 @@ def check(
 
     spec = open_experiment(file)
     found = settings(spec)
-    check_playable(spec)
+    clear_mm = check_playable(spec)
     episodes = counted(len(found) * spec.repeats, "episode")
     print(
         f"{spec.name} ({spec.scenario}): {counted(len(found), 'setting')}, {episodes} of at most "
@@ -129,12 +134,27 @@ def check(
     )
     for phase in spec.phases:
         beam = ", beam" if phase.beam else ""
+        within = spec.of.experiment.conditions[phase.until].within
+        within = within if phase.within < 0.0 else phase.within
+        until = "never" if phase.until == "never" else f"{phase.until} ({within:g})"
         print(
             f"  phase {phase.name}: {', '.join(map(' '.join, phase.arms))}{beam}; "
-            f"until {phase.until}, at most {phase.timeout_s:g} s, then {phase.on_timeout}"
+            f"until {until}, at most {phase.timeout_s:g} s, then {phase.on_timeout}"
+        )
+    if any(phase.beam for phase in spec.phases):
+        print(
+            f"  beam off below {clear_mm:g} mm of clearance{_of_the_scene(spec.limits, clear_mm)}"
         )
     for setting in found:
         print(f"  setting {setting.label}")
+
+
+def _of_the_scene(limits: Limits, clear_mm: float) -> str:
+    """Whose limit of clearance it is, where it is not that of the experiment's file."""
+    if limits.clearance_mm == clear_mm:
+        return ""
+    unused = f"; limits.clearance_mm = {limits.clearance_mm:g} is below it and has no effect"
+    return f", the scene's limit{unused if limits.clearance_mm > 0.0 else ''}"
 
 
 @commands.command("list")

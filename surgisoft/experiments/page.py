@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from surgisoft.agents.evaluate import RATES
-from surgisoft.agents.report import cell, episode_parts
+from surgisoft.agents.evaluate import cell
+from surgisoft.agents.report import episode_parts
 from surgisoft.agents.report_charts import path_chart, spread_chart, sweep_chart
 from surgisoft.experiments.results import Results, SettingResult
 from surgisoft.report import Facts, Gallery, Page, Picture, Section, Share, Table, Text
@@ -15,7 +15,7 @@ from surgisoft.tasks.supervision import Row
 SHOWN = 4
 """Most settings of which the first episode is shown."""
 HOW = (
-    "Means are over episodes, with 95 % intervals in brackets: Wilson's for rates, by bootstrap "
+    "Means are over episodes, with 95 % intervals in brackets: Wilson's for rates, Student's "
     "for all else. Clearance, contact and success come from exact collision checks (FCL) of the "
     "true bodies."
 )
@@ -158,7 +158,7 @@ def _table(results: Results) -> Section:
         (
             setting.label,
             f"{len(setting.rows)}",
-            *(cell(setting.overall[name], name in RATES) for name in known),
+            *(cell(name, setting.overall[name]) for name in known),
         )
         for setting in results.settings
     ]
@@ -168,7 +168,7 @@ def _table(results: Results) -> Section:
 def turned_table(results: Results) -> tuple[list[str], list[tuple[str, ...]]]:
     """Header and rows of the main table, a column for each setting."""
     rows = [
-        (title, *(cell(s.overall[name], name in RATES) for s in results.settings))
+        (title, *(cell(name, s.overall[name]) for s in results.settings))
         for name, title in _known(results).items()
     ]
     return ["mean [95 % interval]", *(setting.label for setting in results.settings)], rows

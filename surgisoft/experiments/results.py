@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from surgisoft.agents.evaluate import RATES, Summary, summary
+from surgisoft.agents.evaluate import Summary, summary
 from surgisoft.experiments.run import log_file
 from surgisoft.experiments.spec import Experiment
 from surgisoft.files import write_atomically, write_json
@@ -76,8 +76,7 @@ def sum_up(spec: Experiment, folder: Path, rows: list[Row]) -> Results:
         episodes = [row for row in rows if row["setting"] == label]
         numbers = [n for n in episodes[0] if n not in (*TEXTS, *varied, "episode")]
         overall = {
-            name: summary(_numbers([row[name] for row in episodes]), name in RATES)
-            for name in numbers
+            name: summary(name, _numbers([row[name] for row in episodes])) for name in numbers
         }
         values = {name: episodes[0][name] for name in varied if name in episodes[0]}
         outcomes = dict(Counter(row["outcome"] for row in episodes).most_common())

@@ -148,12 +148,13 @@ def _check_scene(spec: Experiment, folder: Path) -> None:
         )
 
 
-def check_playable(spec: Experiment) -> None:
+def check_playable(spec: Experiment) -> float:
     """Raise an InputError unless lesions lie on the organ and controllers fit their arms.
 
-    Checked in simulation for every case: observations and actions are the same on the rig.
+    Checked in simulation for every case: observations and actions are the same on the rig. Returns
+    the clearance below which the beam is off, the file's or the scene's, mm.
     """
-    found, seen = settings(spec), set()
+    found, seen, clear_mm = settings(spec), set(), 0.0
     if spec.in_scene:
         for setting in {setting.lesion: setting for setting in found}.values():
             scene_of(spec, setting)
@@ -161,8 +162,10 @@ def check_playable(spec: Experiment) -> None:
         case = setting.case
         if (case.policy, case.arm) not in seen:
             plain = replace(case, plant="simulation", hidden=(), robot_seed=0, rigs=Case.rigs)
-            opened(spec, replace(setting, case=plain))
+            task, _ = opened(spec, replace(setting, case=plain))
+            clear_mm = task.clear_mm
             seen.add((case.policy, case.arm))
+    return clear_mm
 
 
 def check_benches(spec: Experiment, folder: Path | None = None) -> None:

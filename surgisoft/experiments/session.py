@@ -37,10 +37,13 @@ REPLAY_PICTURES_HZ = 1.0
 
 
 def find_experiment(name: str | Path) -> Path:
-    """The file of an experiment, by its path or by the name of a packaged one (`liver`)."""
+    """The file of an experiment, by its path or by the name of a packaged one (`liver`).
+
+    A folder of that name, a scene's perhaps, is no experiment and hides none.
+    """
     path = Path(name)
     named = PACKAGED / f"{path.name}.toml"
-    return named if len(path.parts) == 1 and not path.exists() and named.is_file() else path
+    return named if len(path.parts) == 1 and not path.is_file() and named.is_file() else path
 
 
 def experiments_of(folder: str | Path | None = None) -> list[Path]:

@@ -413,6 +413,10 @@ def _check_whole(spec: Experiment, where: Where) -> None:
             raise (where / "phases" / i / "until").error(
                 f"got '{phase.until}'", f"one of {', '.join(conditions)}"
             )
+        if phase.within > (most := conditions[phase.until].most):
+            raise (where / "phases" / i / "within").error(
+                f"got {phase.within:g}", f"at most {most:g}: {conditions[phase.until].about}"
+            )
         if phase.name in TIMED:
             raise (where / "phases" / i / "name").error(
                 f"got '{phase.name}'", f"another name: '{phase.name}_s' is a column of the results"

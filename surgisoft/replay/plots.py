@@ -15,8 +15,13 @@ if TYPE_CHECKING:  # their import takes seconds, and the view of a bench has no 
     from surgisoft.tasks.episodes.log import EpisodeLog
     from surgisoft.tasks.episodes.parts import ArmLog
 
-SHARES = ("completion", "visited", "view_fraction", "safe")
-"""Measures from 0 to 1, which share one plot."""
+SHARES = {
+    "completion": "done",
+    "visited": "visited",
+    "view_fraction": "in sight",
+    "safe": "safe",
+}
+"""Measures from 0 to 1, which share one plot -> their words in its title."""
 SHOWN_ELSEWHERE = (
     "success",
     "collided",
@@ -94,7 +99,7 @@ def plots_of(log: EpisodeLog) -> tuple[Plot, ...]:
     for name, arm in log.arms.items():
         made.append(Plot(f"Pressure of {name} (kPa)", _pressures(name, arm), "righttop"))
     if shares:
-        title = "Done, in sight (share)"
+        title = f"{', '.join(SHARES[name] for name in shares).capitalize()} (share)"
         made.append(Plot(title, _lines("share", shares), "rightbottom"))
     if log.clearance_mm is not None:
         title = "Clearance (mm), red: limit" if log.limits else "Clearance (mm)"

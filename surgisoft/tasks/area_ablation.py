@@ -198,7 +198,7 @@ AREA_ABLATION = TaskSpec(
     training_steps=LASER_STEPS,
     experiment=laser_experiment(
         "share of the area treated",
-        {"treated": Condition("this share of the area has the dose (0..1)", 0.98, completed)},
+        {"treated": Condition("this share of the area has the dose (0..1)", 0.98, completed, 1.0)},
         {},
     ),
     success_rule=success_rule,

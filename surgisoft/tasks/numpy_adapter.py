@@ -100,7 +100,7 @@ class NumpyAdapter:
     @torch.inference_mode()
     def seeded(self, seeds: Sequence[int]) -> TaskState:
         """Start episodes, one for each seed."""
-        parts = [streams(int(seed), 1, 0, self.task.world.device) for seed in seeds]
+        parts = [streams(seed, 1, 0, self.task.world.device) for seed in seeds]
         return self.episodes.start(joined(parts))
 
     @torch.inference_mode()

@@ -93,7 +93,8 @@ class SurgicalEnv(ParallelEnv):
     def step(self, actions: dict):
         """Advance one step: (observations, rewards, terminations, truncations, infos) by agent.
 
-        Raises InputError before the first reset, or if a live agent has no action.
+        Raises InputError before the first reset, if a live agent has no action, and for the action
+        of an agent that the task does not have.
         """
         if self._batch is None:
             raise InputError("step before reset: call reset() first")
@@ -102,6 +103,11 @@ class SurgicalEnv(ParallelEnv):
         absent = [agent for agent in self.agents if agent not in actions]
         if absent:
             raise InputError(f"no action for {', '.join(absent)}: expected one for each live agent")
+        unknown = [agent for agent in actions if agent not in self.possible_agents]
+        if unknown:
+            raise InputError(
+                f"action for '{unknown[0]}', expected agents {', '.join(self.possible_agents)}"
+            )
         if self.lone is not None:
             return self._lone_step(self.lone, actions)
         held = {agent: np.asarray(actions[agent])[None] for agent in self.agents}

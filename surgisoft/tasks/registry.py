@@ -88,6 +88,13 @@ def offered(path: tuple[str, ...]) -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in entry_points(group=GROUP)}
 
 
+def package_of(task: str) -> str:
+    """Name and version of the installed package that offers a task; empty for tasks of this one."""
+    entry = None if task in TASKS else offered(tuple(sys.path)).get(task)
+    dist = entry.dist if entry else None
+    return f"{dist.name} {dist.version}" if dist else ""
+
+
 @functools.cache
 def _loaded(entry: EntryPoint) -> TaskSpec:
     """The task of an installed package."""

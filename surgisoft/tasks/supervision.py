@@ -7,6 +7,7 @@ supplements a task that was built. `BEAMLESS` serves every task without a beam;
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -32,6 +33,8 @@ class Condition:
     """Default of the threshold."""
     holds: Callable[[Any, TaskState, float], Tensor]
     """(task, state, within) -> (B,) bool; the task as it was built, without phases."""
+    most: float = math.inf
+    """Largest threshold that makes sense, in its unit: 1 for a share."""
 
 
 class Supervision(Protocol):
@@ -140,7 +143,7 @@ NEVER = Condition("only the time ends the phase", 0.0, _never)
 """Condition of a phase that its time ends, the default of every task."""
 AT_REST = Condition("chambers of all arms this near to rest (kPa)", 1.0, _at_rest)
 """Condition of a phase in which every arm goes back."""
-SUCCEEDED = Condition("the task's measure of success is at least this (0..1)", 1.0, _succeeded)
+SUCCEEDED = Condition("the task's measure of success is at least this (0..1)", 1.0, _succeeded, 1.0)
 """Condition of the phase in which the task is done."""
 
 

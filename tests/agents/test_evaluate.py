@@ -11,7 +11,7 @@ import pytest
 import torch
 from scipy.stats import binomtest
 
-from surgisoft.agents.evaluate import bootstrap, episode_table, summary, wilson
+from surgisoft.agents.evaluate import episode_table, student, summary, wilson
 from surgisoft.agents.exact_checks import Contact, EpisodeCheck
 from surgisoft.agents.rollout import Rollout
 from surgisoft.agents.session import EvaluationRequest, evaluate
@@ -29,7 +29,7 @@ NAN = float("nan")
 )
 def test_interval_of_a_rate_as_in_tables(hits, count, low, high):
     """Newcombe 1998, table I (method 3): Wilson's interval."""
-    found = summary(np.repeat([1.0, 0.0], [hits, count - hits]), rate=True)
+    found = summary("success", np.repeat([1.0, 0.0], [hits, count - hits]))
     assert (found.low, found.high) == pytest.approx((low, high), abs=1e-4)
 
 
@@ -41,18 +41,39 @@ def test_interval_of_a_rate_as_scipy_has_it(hits, count):
     assert wilson(hits, count) == pytest.approx(tuple(expected), abs=1e-14)
 
 
-def test_bootstrap_interval_holds_the_mean_as_often_as_it_says():
-    rng, inside = np.random.default_rng(1), 0
-    for _ in range(200):
-        low, high = bootstrap(rng.exponential(size=60))
-        inside += low <= 1.0 <= high
-    assert 0.87 <= inside / 200 <= 0.99
+def test_interval_of_a_mean_as_in_a_textbook():
+    """Student 1908, section IX: the difference of hours of sleep by two soporifics, ten patients.
+
+    Mean 1.58 h, standard error 0.389 h, 9 degrees of freedom (2.262): 0.70 to 2.46 h.
+    """
+    hours = np.array([1.2, 2.4, 1.3, 1.3, 0.0, 1.0, 1.8, 0.8, 4.6, 1.4])
+    assert student(hours) == pytest.approx((0.70, 2.46), abs=0.005)
+
+
+@pytest.mark.parametrize(("episodes", "least"), [(2, 0.93), (5, 0.93), (10, 0.93)])
+def test_interval_of_a_mean_holds_it_as_often_as_it_says(episodes, least):
+    """95 %, for few episodes as well."""
+    draws = np.random.default_rng(1).normal(size=(2000, episodes))
+    inside = [low <= 0.0 <= high for low, high in map(student, draws)]
+    assert least <= np.mean(inside) <= 0.97
+
+
+def test_the_interval_of_a_share_ends_at_one():
+    found = summary("completion", np.array([1.0, 1.0, 0.9]))
+    assert found.low < 0.9
+    assert found.high == 1.0
+
+
+def test_one_episode_has_no_interval():
+    found = summary("time_s", np.array([4.0]))
+    assert (found.mean, found.episodes) == (4.0, 1)
+    assert np.isnan([found.low, found.high]).all()
 
 
 def test_a_summary_leaves_out_what_does_not_apply():
-    found = summary(np.array([1.0, NAN, 3.0]))
+    found = summary("time_s", np.array([1.0, NAN, 3.0]))
     assert (found.mean, found.least, found.most, found.episodes) == (2.0, 1.0, 3.0, 2)
-    nothing = summary(np.array([NAN]))
+    nothing = summary("time_s", np.array([NAN]))
     assert nothing.episodes == 0
     assert np.isnan(nothing.mean)
 

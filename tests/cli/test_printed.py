@@ -115,7 +115,8 @@ def test_compare_advises_to_diagnose_the_closest_of_several_models(
 
 
 def summary(mean: float, episodes: int = 3) -> SimpleNamespace:
-    return SimpleNamespace(mean=mean, low=mean - 0.1, high=mean + 0.1, episodes=episodes)
+    ends = {"least": mean - 1.0, "most": mean + 1.0, "episodes": episodes}
+    return SimpleNamespace(mean=mean, low=mean - 0.1, high=mean + 0.1, **ends)
 
 
 def test_evaluate_prints_a_column_for_each_policy(capsys, monkeypatch):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from pathlib import Path
 
 import pytest
 
@@ -9,7 +10,7 @@ from surgisoft.cli import run
 from surgisoft.config import Where, read_toml
 from surgisoft.errors import InputError
 from surgisoft.experiments.plan import rig_config, settings
-from surgisoft.experiments.session import with_rigs
+from surgisoft.experiments.session import find_experiment, with_rigs
 from surgisoft.experiments.spec import load_experiment, save_experiment
 from surgisoft.scene.spec import PHANTOM
 from tests.experiments.tiny import FAULT, TINY, write
@@ -48,6 +49,11 @@ BAD = {
     ),
     'until = "cut"': ('arms = "policy"', "phases[1].arms", "an arm (laser, endoscope) or one of"),
     "timeout_s = 30.0": ("timeout_s = 3.0\nhold_s = 4.0", "phases[1].hold_s", "at most timeout_s"),
+    'endoscope = "policy"\nbeam = true': (
+        'endoscope = "policy"\nbeam = true\nwithin = 2.0',
+        "phases[1].within",
+        "at most 1: this share of the ring is cut",
+    ),
     '"look"': ('"time"', "phases[0].name", "'time_s' is a column of the results"),
     "time_s = 0.5": ('time_s = 0.5\nretreat = "out"', "limits.retreat", "one of the phases"),
 }
@@ -247,3 +253,25 @@ def test_files_with_former_names_open(tmp_path):
     both = case + "specimen = 3\n"
     with pytest.raises(InputError, match="got specimen and robot_seed; expected robot_seed alone"):
         load_experiment(write(tmp_path, TINY + both))
+
+
+def test_check_names_the_limit_of_clearance_that_holds(tmp_path, capsys):
+    """The scene's is 1 mm; a looser one in the file has no effect."""
+    for given, said in (
+        ("", "beam off below 1 mm of clearance, the scene's limit\n"),
+        ("clearance_mm = 3.0", "beam off below 3 mm of clearance\n"),
+        ("clearance_mm = 0.5", "limit; limits.clearance_mm = 0.5 is below it and has no effect\n"),
+    ):
+        path = write(tmp_path, TINY.replace("[limits]", f"[limits]\n{given}"))
+        assert run(["experiment", "check", str(path)]) == 0
+        printed = capsys.readouterr().out
+        assert said in printed
+        assert "until centred (1), at most 0.3 s, then go on" in printed
+
+
+def test_a_folder_of_that_name_does_not_hide_a_packaged_experiment(tmp_path, monkeypatch):
+    (tmp_path / "liver").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert find_experiment("liver") == PHANTOM / "experiments" / "liver.toml"
+    (tmp_path / "fault").touch()
+    assert find_experiment("fault") == Path("fault"), "a file is meant"

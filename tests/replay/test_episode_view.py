@@ -326,6 +326,14 @@ def test_a_legend_names_only_the_colours_that_are_drawn(log, replay):
     assert "white points" in lone
 
 
+def test_the_plot_of_shares_is_named_by_what_is_in_it(log):
+    titles = [plot.title for plot in plots_of(log)]
+    assert "Done, in sight (share)" in titles
+    done = {name: each for name, each in log.measures.items() if name != "view_fraction"}
+    titles = [plot.title for plot in plots_of(replace(log, measures=done))]
+    assert "Done (share)" in titles
+
+
 def test_pressure_lines_are_named(log):
     (laser,) = (plot for plot in plots_of(log) if plot.title == "Pressure of laser (kPa)")
     assert laser.legend

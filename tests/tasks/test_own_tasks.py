@@ -66,6 +66,12 @@ def test_it_is_trained_and_evaluated_by_its_name(installed, tmp_path, monkeypatc
     assert last["term/arm/smooth"] < 0.0
     assert run(["evaluate", "own", "--episodes", "1"]) == 0
     assert "smooth_circle, simulation: 1 episode" in capsys.readouterr().out
+    config = json.loads((tmp_path / "own" / "config.json").read_text())
+    monkeypatch.setattr(sys, "path", [each for each in sys.path if each != str(installed)])
+    assert run(["evaluate", "own", "--episodes", "1"]) == 2
+    told = capsys.readouterr().err
+    assert "own: was trained on the task 'smooth_circle', which is not installed here" in told
+    assert f"install {config['task_package']} first" in told
 
 
 def test_what_a_package_offers_is_checked(installed):

@@ -1,13 +1,15 @@
 """Random streams: the published generator, and independence of what stands beside them."""
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
+from surgisoft.errors import InputError
 from surgisoft.tasks.world.pytree import rows
-from surgisoft.tasks.world.random_streams import Stream, streams
+from surgisoft.tasks.world.random_streams import Stream, episode_streams, streams
 
 LARGE = 2**64
 
@@ -48,6 +50,14 @@ def test_draws_in_parts_are_the_draws_at_once():
     whole = streams(5, 4).uniform(0.0, 1.0, 6)[1]
     stream, first = streams(5, 4).uniform(0.0, 1.0, 2)
     assert torch.equal(torch.cat((first, stream.uniform(0.0, 1.0, 4)[1]), 1), whole)
+
+
+@pytest.mark.parametrize("seed", [-1, 0.5, "0"])
+def test_a_seed_is_a_whole_number_from_0_on(seed):
+    with pytest.raises(InputError, match=r"seed is .*expected"):
+        streams(seed, 1)
+    with pytest.raises(InputError, match=r"seed is .*expected"):
+        episode_streams(seed, 1)
 
 
 def test_a_stream_does_not_depend_on_its_neighbours():

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from surgisoft.compiled import compiled
+from surgisoft.tasks.arguments import whole
 
 _GAMMA = -0x61C8864680B583EB
 _MIX_1 = -0x40A7B892E31B1A47
@@ -51,14 +52,22 @@ class Stream:
 
 
 def streams(seed: int, count: int, first: int = 0, device: str | torch.device = "cpu") -> Stream:
-    """Random number streams `first` to `first + count - 1` of a seed."""
+    """Random number streams `first` to `first + count - 1` of a seed, a whole number from 0 on.
+
+    Raises InputError for another seed.
+    """
+    seed = whole("seed", seed, 0)
     place = torch.arange(first, first + count, dtype=torch.int64, device=device)
     root = _mix(torch.tensor([_wrapped(seed)], dtype=torch.int64, device=device))
     return Stream(_mix(root + _GAMMA * (place + 1)), torch.zeros_like(place))
 
 
 def episode_streams(seed: int, count: int, device: str | torch.device = "cpu") -> Stream:
-    """The first stream of each of the seeds `seed` to `seed + count - 1`."""
+    """The first stream of each of the seeds `seed` to `seed + count - 1`, from 0 on.
+
+    Raises InputError for another seed.
+    """
+    seed = whole("seed", seed, 0)
     seeds = torch.arange(count, dtype=torch.int64, device=device) + _wrapped(seed)
     return Stream(_mix(_mix(seeds) + _GAMMA), torch.zeros_like(seeds))
 

@@ -372,7 +372,7 @@ class CrossValidation:
         mix[0, 0] = 1.0
         owner = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
         mix[np.arange(1, len(columns)), 1 + owner] = amplitudes
-        products = np.moveaxis(self.held_out.among(columns)[level], -1, 0)
+        products = np.moveaxis(self.held_out.among(columns, level), -1, 0)
         return mix.T @ products.astype(float) @ mix
 
     def _fitted(self, chosen: np.ndarray) -> tuple[np.ndarray, int]:
@@ -472,12 +472,14 @@ class HeldOut:
         older = np.concatenate([self.further, mirrored], axis=1)
         return HeldOut(self.first, np.concatenate([older, border], axis=2))
 
-    def among(self, columns: np.ndarray) -> np.ndarray:
-        """(L, k, k, B) products of some columns (k,)."""
-        levels, blocks, count = len(self.first), self.first.shape[2], len(columns)
-        answer = np.empty((levels, count, count, blocks), np.float32)
-        for level, i, j in np.ndindex(levels, count, count):
-            answer[level, i, j] = _pair(self.first, self.further, level, columns[i], columns[j])
+    def among(self, columns: np.ndarray, level: int) -> np.ndarray:
+        """(k, k, B) products of some columns (k,) at a level."""
+        count = len(columns)
+        answer = np.empty((count, count, self.first.shape[2]), np.float32)
+        for i in range(count):
+            for j in range(i + 1):
+                pair = _pair(self.first, self.further, level, columns[i], columns[j])
+                answer[i, j] = answer[j, i] = pair
         return answer
 
 

@@ -170,10 +170,14 @@ class ModelSelection:
 
     def explained_mm(self, chosen: Sequence[int], amplitudes: np.ndarray) -> np.ndarray:
         """(S, n, 3) what some sensitivities explain at amplitudes (k,), mm."""
-        answer = np.zeros(self.problem.residual.shape)
+        mixes: dict[int, np.ndarray] = {}
         for one, amplitude in zip(chosen, amplitudes, strict=True):
             number, own = self._place[one]
-            answer += amplitude * self.candidates[number].sensitivities[..., own]
+            of = self.candidates[number].sensitivities
+            mixes.setdefault(number, np.zeros(of.shape[3], of.dtype))[own] = amplitude
+        answer = np.zeros(self.problem.residual.shape)
+        for number, mix in mixes.items():
+            answer += self.candidates[number].sensitivities @ mix
         return answer
 
     def losses(self, chosen: tuple[int, ...] = (), common: tuple[int, ...] = ()) -> np.ndarray:

@@ -170,17 +170,12 @@ class Moments:
 
     def gram(self) -> np.ndarray:
         """(K, K) products of the sensitivities under Sigma: the model discrepancy is taken out."""
-        answer = self.plain.sum(0)
-        for output, ratio in enumerate(self.ratio):
-            normal = self.own + np.eye(len(self.own)) / ratio
-            half = linalg.solve_triangular(
-                linalg.cholesky(normal, lower=True),
-                np.concatenate(list(self.cross[:, output]), axis=1),
-                lower=True,
-                check_finite=False,
-            )
-            for part in np.split(half, 3, axis=1):
-                answer = answer - part.T @ part
+        # One rotation of the features serves the normal matrices of all outputs.
+        values, vectors = linalg.eigh(self.own, check_finite=False)
+        weight = np.sqrt(1.0 / (np.maximum(values, 0.0) + 1.0 / self.ratio[:, None]))
+        turned = weight[..., None] * (vectors.T @ self.cross)
+        turned = turned.reshape(-1, turned.shape[-1])
+        answer = self.plain.sum(0) - turned.T @ turned
         return 0.5 * (answer + answer.T)
 
 

@@ -706,6 +706,7 @@ def result_of(
             *told,
             *(local_error(along, recordings) if kind not in NAMING else ()),
             *would_explain(found, decision),
+            *second_too(decision),
             *amplitudes_that_vary(evidence, decision),
         ),
         statistics=evidence,
@@ -738,6 +739,21 @@ def would_explain(found: Findings, decision: Decision) -> list[str]:
     if known_effects()[best.effect].stage in FRONT:
         text += f"; fit the network together with it (fit --effects {best.effect}) and compare"
     return [text]
+
+
+def second_too(decision: Decision) -> list[str]:
+    """An effect that may be missing beside a named one, in words; empty where none is likely."""
+    chances = decision.probabilities
+    if decision.kind not in ("identified", "ambiguous") or chances.pair < WORTH_TELLING:
+        return []
+    named = [name for name in chances.two if name in decision.effects]
+    others = [name for name in chances.two if name not in decision.effects]
+    if len(named) != 1 or len(others) != 1:
+        return []
+    return [
+        f"{others[0]} may be missing beside {named[0]} (probability {chances.pair:.2f} that both "
+        f"are): 'surgisoft improve' adds one after the other, as long as each lowers the error"
+    ]
 
 
 def amplitudes_that_vary(evidence: Evidence, decision: Decision) -> list[str]:

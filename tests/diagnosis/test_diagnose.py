@@ -17,6 +17,7 @@ from surgisoft.diagnosis.diagnose import (
     diagnose,
     estimate_in_words,
     knock,
+    second_too,
     would_explain,
 )
 from surgisoft.diagnosis.inputs import identification_problem
@@ -241,6 +242,25 @@ def test_what_would_explain_an_error_of_the_fit_is_told(effect, kind, chance, si
     assert len(checks) == (told is not None)
     assert told is None or told in checks[0]
     assert told is None or ("fit --effects" in checks[0]) == (effect == "creep")
+
+
+@pytest.mark.parametrize(
+    ("kind", "effects", "both", "told"),
+    [
+        ("identified", ("drift",), 0.34, True),
+        ("ambiguous", ("creep", "drift"), 0.34, True),
+        ("identified", ("drift",), 0.1, False),
+        ("identified", ("hysteresis",), 0.34, False),
+        ("ambiguous", ("twist", "drift"), 0.34, False),
+        ("several", ("drift", "twist"), 0.34, False),
+        ("cannot_tell", (), 0.34, False),
+    ],
+)
+def test_an_effect_that_may_be_missing_beside_the_named_one_is_told(kind, effects, both, told):
+    chances = SimpleNamespace(pair=both, two=("drift", "twist"))
+    checks = second_too(SimpleNamespace(kind=kind, effects=effects, probabilities=chances))
+    expected = "twist may be missing beside drift (probability 0.34 that both are): 'surgisoft im"
+    assert [check.startswith(expected) for check in checks] == [True] * told
 
 
 def test_a_knock_is_told_where_a_turn_at_one_moment_explains_more(found):

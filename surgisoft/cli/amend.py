@@ -82,8 +82,8 @@ def amend(
     """Amend a model: add a physical effect and validate it on held-out data.
 
     The parameters are fitted to the first three quarters of each recording and validated on the
-    last quarter. Where the error does not fall significantly, or the model had been fitted to these
-    rows before, nothing is claimed or written (exit code 1).
+    last quarter. If the error does not fall significantly, or if the model was already fitted to
+    these rows, nothing is claimed or written (exit code 1).
     """
     check_free(json_file, "error_mm")
     check_folder(report)

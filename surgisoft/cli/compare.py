@@ -82,10 +82,10 @@ def compare(
 ) -> None:
     """Compare arm models with measurements: the error, and what it depends on.
 
-    The error is that over all rows. The noise floor, the best achievable error and the share that
-    is explainable are of the rows that diagnose uses, the first three quarters of each recording,
-    so that both commands state the same numbers. Several models before the recordings are shown
-    together on one error scale.
+    The error is that over all rows. The noise floor, the best achievable error and the explainable
+    share are computed on the rows that diagnose uses, the first three quarters of each recording,
+    so both commands state the same numbers. If several models are given, before the recordings,
+    they are shown together on one error scale.
     """
     check_free(json_file, "rmse_mm")
     check_folder(report)

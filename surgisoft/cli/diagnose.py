@@ -72,7 +72,7 @@ def diagnose(
         typer.Option(
             metavar="EFFECT...",
             autocompletion=complete_effects,
-            help="Effects to exclude, because the setup rules them out, such as contact.",
+            help="Effects to exclude because the set-up rules them out, such as contact.",
         ),
     ] = None,
     refit: Refit = "auto",
@@ -87,7 +87,7 @@ def diagnose(
         bool,
         typer.Option(
             "--setup-tests/--no-setup-tests",
-            help="Whether frames, units, orders, chambers and clocks are tested before effects.",
+            help="Whether to test frames, units, orders, chambers and clocks before effects.",
         ),
     ] = True,
     effect_files: EffectFiles = None,

@@ -59,7 +59,7 @@ def fit(
         Literal["haw_nn", "kernel", "auto", "constant_curvature", "recurrent"],
         typer.Option(
             help="haw_nn: HAW-NN; kernel: arcs and kernel regression on the actuation and its low "
-            "passes, for few data; auto: of haw_nn and kernel the one with the lower held-out "
+            "passes, for small data sets; auto: haw_nn or kernel, whichever has the lower held-out "
             "error; constant_curvature and recurrent: baselines."
         ),
     ] = "haw_nn",
@@ -76,8 +76,8 @@ def fit(
         typer.Option(
             min=1,
             help="Number of networks in an ensemble, whose mean is the prediction; each is trained "
-            "without a different part of the data. Lower error where data are few; slower to "
-            "evaluate.",
+            "without a different part of the data. Lower error with small data sets; slower "
+            "to evaluate.",
         ),
     ] = 1,
     widths: Annotated[

@@ -34,22 +34,22 @@ def import_(
         typer.Option(
             "--map",
             metavar="MAP.toml",
-            help="Map file, or motive, the map for files of OptiTrack Motive. The log of an "
-            "interrupted recording (.jsonl), and a LeRobotDataset with a recording's names, need "
-            "none.",
+            help="Map file; or motive or motive-bodies, the maps for files of OptiTrack Motive. "
+            "The log of an interrupted recording (.jsonl), and a LeRobotDataset with the names of "
+            "a recording, need no map.",
         ),
     ] = None,
     draft: Annotated[
         Path | None,
         typer.Option(
             metavar="NEW.toml",
-            help="Write a draft of the map from the names of a file's columns, to be checked, "
-            "and nothing else.",
+            help="Only write a draft of the map, from the names of a file's columns; check it "
+            "before you use it.",
         ),
     ] = None,
     force: Force = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show what would be written to REC, write nothing.")
+        bool, typer.Option("--dry-run", help="Show what would be written to REC; write nothing.")
     ] = False,
     model: Annotated[
         Path | None,
@@ -62,8 +62,8 @@ def import_(
 ) -> None:
     """Import a laboratory's files as recordings; a map states columns, units and frames.
 
-    It reports what looks wrong: lengths, reversed key points, clocks that differ. With a
-    model of the arm, frames, units, orders, chambers and dead channels are tested, too.
+    Reports what looks wrong: lengths, reversed key points, clocks that differ. With a model of the
+    arm, frames, units, orders, chambers and dead channels are tested, too.
     """
     from surgisoft.measurement.importing import import_recordings
     from surgisoft.measurement.recordings import (
@@ -190,7 +190,7 @@ def recording_(
 ) -> None:
     """Show what recordings hold: rows, runs, rates, ranges, missing values, warnings.
 
-    With --lerobot they are written as a LeRobotDataset, too, which LeRobot trains policies on.
+    With --lerobot they are also written as a LeRobotDataset, from which LeRobot trains policies.
     """
     from surgisoft.measurement.recordings import summary
     from surgisoft.measurement.recordings.lerobot import TASK, save_lerobot

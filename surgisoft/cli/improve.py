@@ -55,10 +55,10 @@ def improve(
 ) -> None:
     """Improve a model: repeat diagnosis and amendment until no further effect is significant.
 
-    The result is validated on the last quarter of each recording. Where no effect was added, or
-    the error did not fall significantly, nothing is written (exit code 1). With --before, what
-    has changed since is named and added, and the network stays as it is. Ctrl-C keeps the rounds
-    that are finished: their model, report and errors.
+    The result is validated on the last quarter of each recording. If no effect was added, or the
+    error did not fall significantly, nothing is written (exit code 1). With --before, the change
+    since those recordings is named and added, and the network stays as it is. Ctrl-C keeps the
+    finished rounds: their model, report and errors.
     """
     check_free(json_file, "rounds")
     check_folder(report)

@@ -16,7 +16,7 @@ Model = Annotated[
     Path,
     Argument(
         metavar="MODEL",
-        help="Folder of an arm model, or default: the arm of the package. A model of your own "
+        help="Folder of an arm model, or default: the arm of the package. Or a model of your own "
         "(docs/your_model.md): package.module:object or FILE.py:object, a Python callable, which "
         "is imported and run, so name only what you trust.",
     ),
@@ -25,10 +25,10 @@ AnyModel = Annotated[
     Path,
     Argument(
         metavar="MODEL",
-        help="Folder of an arm model, or default: the arm of the package. A model of your own "
+        help="Folder of an arm model, or default: the arm of the package. Or a model of your own "
         "(docs/your_model.md): package.module:object or FILE.py:object, a Python callable, which "
-        "is imported and run, so name only what you trust; or its predictions in a file beside "
-        "the recording (.csv, .parquet); with --predictions any name.",
+        "is imported and run, so name only what you trust; or a file with its predictions for the "
+        "recording (.csv, .parquet); with --predictions any name.",
     ),
 ]
 Predictions = Annotated[
@@ -36,8 +36,9 @@ Predictions = Annotated[
     Option(
         "--predictions",
         metavar="FILE...",
-        help="What a model in any language predicts: files with the columns k0_x_mm ... of the "
-        "rows of each REC, in order, then of each --before. MODEL is then a name for it.",
+        help="Predictions of a model in any language: one file for each REC, in order, then one "
+        "for each --before, with the columns k0_x_mm ... and the rows of that recording. MODEL is "
+        "then only a name.",
     ),
 ]
 ModelError = Annotated[
@@ -45,8 +46,8 @@ ModelError = Annotated[
     Option(
         "--model-error",
         metavar="MM",
-        help="RMS error of a key point that a callable model, or one given by predictions, was "
-        "validated with, mm; default: what it states itself, else its error on --before.",
+        help="Validated RMS error of a key point, mm, of a callable model or of a model given by "
+        "its predictions. Default: the error that the model states, else its error on --before.",
     ),
 ]
 Recordings = Annotated[
@@ -57,19 +58,19 @@ Before = Annotated[
     Option(
         "--before",
         metavar="REC...",
-        help="Recordings from before a change. Where they were made with the same actuation, the "
-        "difference between the measurements is explained, in which the model's error cancels; "
-        "otherwise the model's residuals before and after are compared, and effects are fitted as "
-        "without this option.",
+        help="Recordings from before a change. If they were made with the same actuation, the "
+        "effects have to explain the difference between the measurements, in which the model's "
+        "error cancels. Otherwise the model's residuals before and after are compared, and effects "
+        "are fitted as without this option.",
     ),
 ]
 Paired = Annotated[
     str,
     Option(
         metavar="auto|always|never",
-        help="Whether rows of the same actuation before and after are paired: 'auto' if at least "
-        "half can be; 'always' also if fewer can be, for a minute in all, and an error otherwise; "
-        "'never' not at all.",
+        help="When to pair rows that have the same actuation before and after. auto: if at least "
+        "half of the rows have a partner; always: also if fewer have one, but at least a minute in "
+        "all, and an error otherwise; never: not at all.",
     ),
 ]
 NewModel = Annotated[Path, Option("-o", "--output", metavar="NEW", help="Folder of the new model.")]
@@ -127,10 +128,10 @@ EffectFiles = Annotated[
         "--model-code",
         metavar="FILE.py|PACKAGE.MODULE:OBJECT...",
         callback=_register,
-        help="Files of user-defined effects (docs/effects.md): those in the model, and further "
-        "candidates. As --model-code (another name of this option): the callable that the model "
-        "was made from (docs/your_model.md). All of them are executed, so name only files that you "
-        "trust.",
+        help="Files of user-defined effects (docs/effects.md), those in the model and further "
+        "candidates; or the callable that the model was made from (docs/your_model.md). "
+        "--model-code is another name of this option. The files are executed, so name only files "
+        "that you trust.",
     ),
 ]
 """Option of every command that opens a model. Reading the command line runs the code."""
@@ -201,8 +202,8 @@ Replay = Annotated[
 Force = Annotated[bool, Option("--force", help="Replace the output of an earlier call.")]
 
 _RIG = (
-    "Rig: a name with its options (virtual, elastica, those of other packages; 'surgisoft rig "
-    "list' shows them), or package.module:object."
+    "Rig: a name with its options, such as virtual, elastica or serial ('surgisoft rig list' shows "
+    "all), or package.module:object."
 )
 Rig = Annotated[str, Option("--rig", metavar="NAME[:option=value,...]", is_eager=True, help=_RIG)]
 RigsOfArms = Annotated[
@@ -211,7 +212,7 @@ RigsOfArms = Annotated[
         "--rig",
         metavar="NAME[:option=value,...]",
         help=_RIG + " One for all arms of the task, or ARM=NAME for single arms ('laser=NAME "
-        "endoscope=NAME'), the others then being virtual.",
+        "endoscope=NAME'); the other arms then run on the virtual rig.",
     ),
 ]
 
@@ -219,7 +220,7 @@ Cluster = Annotated[
     str | None,
     Option(
         metavar="ADDRESS",
-        help="Dask scheduler (tcp://host:8786) whose workers run the work in place of processes on "
+        help="Dask scheduler (tcp://host:8786) whose workers do the work instead of processes on "
         "this machine. Default: the environment variable SURGISOFT_CLUSTER.",
     ),
 ]
@@ -239,8 +240,8 @@ Hidden = Annotated[
         "--hidden",
         metavar="NAME[:X][@S]...",
         autocompletion=complete_hidden,
-        help="Hidden effects of the rig, which the model lacks, with their amplitudes; default 1. "
-        "On the virtual rig @S lets one begin S seconds after the first reset.",
+        help="Hidden effects of the rig, which the model lacks. X is the amplitude, default 1. On "
+        "the virtual rig @S starts the effect S seconds after the first reset.",
     ),
 ]
 Arm = Annotated[
@@ -285,9 +286,9 @@ Refit = Annotated[
     Literal["auto", "never", "always"],
     Option(
         "--refit",
-        help="Fit candidate effects together with the network; held-out runs decide. auto: only if "
-        "the error is far above the noise floor but about as large as the model's validated error, "
-        "as happens if the network has learned to imitate a lag. Takes minutes.",
+        help="Fit candidate effects together with the network; held-out data decide. auto: only if "
+        "the network may have learned to imitate an effect, such as a lag: the error is far above "
+        "the noise floor, but about as large as the model's validated error. Takes minutes.",
     ),
 ]
 REFIT_PROCESSES = min(2, os.cpu_count() or 1)

@@ -26,9 +26,9 @@ def new(
         list[str],
         typer.Argument(
             metavar="MESH",
-            help="Mesh files (stl, obj, ply, off, glb) or a segmented image (nii, nii.gz, nrrd), "
-            "the organ first. FILE:keep-out or FILE:support sets a role; the default role of "
-            "further files is keep-out.",
+            help="Mesh files (stl, obj, ply, off, glb, gltf) or a segmented image (nii, nii.gz, "
+            "nrrd), the organ first. FILE:keep-out or FILE:support sets a role; the default role "
+            "of further files is keep-out.",
         ),
     ],
     output: Annotated[

@@ -158,16 +158,16 @@ def train(
         typer.Option(
             "--compile",
             help="Compile the loss of an update with torch.compile, which needs a C++ compiler and "
-            "pays with few --envs; with --device cuda the arms' step, which needs Triton "
-            "(docs/training.md).",
+            "is faster with few --envs only; with --device cuda, compile the step of the arms, "
+            "which needs Triton (docs/training.md).",
         ),
     ] = False,
     logger: Annotated[
         str,
         typer.Option(
             metavar="tensorboard|wandb|mlflow|neptune",
-            help="Where the curves go beside the run's folder. With tensorboard nothing leaves "
-            "this machine.",
+            help="Where the curves go in addition to the run's folder. With tensorboard nothing "
+            "leaves this machine.",
         ),
     ] = "tensorboard",
     threads: Threads = 1,
@@ -175,8 +175,8 @@ def train(
 ) -> None:
     """Train the agents of a task with PPO, all at the same time.
 
-    The folder of the run holds all that is needed to open it. After Ctrl-C,
-    --resume continues with the same numbers as an uninterrupted run. For several processes:
+    The folder of the run holds everything that is needed to open it. After Ctrl-C, --resume
+    continues with the same numbers as an uninterrupted run. For several processes:
     torchrun --nproc-per-node N -m surgisoft train ...
     """
     from surgisoft.agents.training_request import shortfall

@@ -34,6 +34,7 @@ from surgisoft.diagnosis.decision import (
     decision_of,
     features_of,
     probabilities,
+    shares_of,
 )
 
 PENALTIES = (0.3, 1.0, 3.0, 10.0, 30.0)
@@ -62,10 +63,13 @@ TWIN_WEIGHTS = (0.0, 0.1, 0.3, 1.0)
 """Weights that are tried of a case whose truth was no candidate, in units of a real case."""
 
 
-def sample(name: str, cases: Sequence[Labelled]) -> list[tuple[np.ndarray, np.ndarray, Labelled]]:
+def sample(
+    name: str, cases: Sequence[Labelled], first: Logistic | None = None
+) -> list[tuple[np.ndarray, np.ndarray, Labelled]]:
     """(features, right, case) of the cases that a model is fitted to.
 
-    `right` is 0 or 1; for `first` (E,) whether each effect is missing.
+    `right` is 0 or 1; for `first` (E,) whether each effect is missing. first: the fitted model of
+    that name, whose probabilities are a feature of `two`.
     """
     answer = []
     for case in cases:
@@ -89,10 +93,11 @@ def sample(name: str, cases: Sequence[Labelled]) -> list[tuple[np.ndarray, np.nd
             pair = [one.effects for one in case.evidence.proposals if len(one.effects) == 2]
             if case.label != "known" or not pair or case.size < WEAK:
                 continue
-            hit = set(pair[0]) & set(case.truth)
-            if not hit:
-                continue
-            right = np.array(float(len(hit) == 2))
+            assert first is not None, "`two` is fitted after `first`"
+            right = np.array(float(set(pair[0]) == set(case.truth)))
+            shares = shares_of(case.evidence, first)
+            answer.append((features_of(name, case.evidence, shares), right, case))
+            continue
         else:
             names = [one.effect for one in case.evidence.effects]
             right = np.array([float(one in case.truth) for one in names])
@@ -266,10 +271,17 @@ Settings = dict[str, Setting]
 
 def _models(cases: Sequence[Labelled], settings: Settings) -> dict[str, Logistic]:
     """The five models of given settings."""
-    return {
-        name: fit_one(name, sample(name, cases), each.penalty, each.twin)
+    first = fit_one("first", sample("first", cases), *_values(settings["first"]))
+    others = {
+        name: fit_one(name, sample(name, cases, first), *_values(each))
         for name, each in settings.items()
+        if name != "first"
     }
+    return {"first": first, **others}
+
+
+def _values(setting: Setting) -> tuple[float, float]:
+    return setting.penalty, setting.twin
 
 
 Predicted = list[tuple[Labelled, Probabilities]]
@@ -330,8 +342,12 @@ def names_wrongly(case: Labelled, found: Decision) -> bool:
 
 def fit(cases: Sequence[Labelled], command: str = "") -> dict:
     """The asset's values: a decision fitted to cases."""
-    samples = {name: sample(name, cases) for name in FEATURES}
-    settings = {name: setting_of(name, some) for name, some in samples.items()}
+    samples, settings = {"first": sample("first", cases)}, {}
+    settings["first"] = setting_of("first", samples["first"])
+    first = fit_one("first", samples["first"], *_values(settings["first"]))
+    for name in FEATURES:
+        samples[name] = sample(name, cases, first)
+        settings[name] = settings.get(name) or setting_of(name, samples[name])
     models = {}
     for name, model in _models(cases, settings).items():
         models[name] = {

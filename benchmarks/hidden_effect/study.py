@@ -90,6 +90,8 @@ class StudyConfig:
     def __post_init__(self):
         if not 0.0 < self.strength <= 10.0:
             raise InputError(f"strength is {self.strength}, expected more than 0, at most 10")
+        if self.episodes < 2:
+            raise InputError(f"episodes is {self.episodes}, expected 2 or more for their interval")
 
 
 @dataclass(frozen=True)

@@ -6,16 +6,18 @@ probabilities:
 - `missing`: something is missing that acts on the arm, in the list of effects or not;
 - `known`: what is missing is in the list, given that something is;
 - `first`: which effect of the list it is, given that it is in the list: a conditional logit over
-  all effects (McFadden 1974), P(e) proportional to exp(w . x_e);
-- `two`: the two proposed effects are both missing, given that one of them is;
+  all effects (McFadden 1974), P(e | list) proportional to exp(w . x_e);
+- `two`: the two proposed effects are both missing, given that some effect of the list is;
 - `network`: the model is off, undertrained or that of another arm, given that no effect of the list
   is missing; not asked of a paired difference, which has no error of a model in it.
 
-So P(e) = P(missing) P(known) P(e | known), and two effects e and f are both missing with the
-probability (P(e) + P(f)) P(both | one of them). Every weight has a fixed sign: more evidence
-for a statement never makes it less probable. The probabilities of the most probable effect and of
-the two most probable ones are products of three fits; two curves calibrate them (Platt 1999), and
-what remains to 1 is shared by the others as before. Each statement that could be made has one
+So two effects e and f are both missing with the probability P(missing) P(known) P(two). What
+`first` says holds where only one is: P(e) is a mixture of P(e | list) and, where both are, of P(e |
+list) over the two alone (McLachlan & Peel 2000), since a third effect may explain more alone than
+either of two that explain everything together. Every weight has a fixed sign: more evidence for a
+statement never makes it less probable. The probabilities of the most probable effect and of the two
+most probable ones are products of several fits; two curves calibrate them (Platt 1999), and what
+remains to 1 is shared by the others as before. Each statement that could be made has one
 probability (`Statement`), and the result is the one whose worth to its reader, weighed with it, is
 largest (`criteria.Worth`; Savage 1954). "Cannot tell" is worth 0 (Chow 1970: a statement that is
 not made), so it is the result only where no statement is probable enough. Weights, curves, sources
@@ -26,7 +28,7 @@ import hashlib
 import json
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -62,7 +64,7 @@ what is missing; how well recordings of an unchanged arm agree is not known well
 too few motions; the schedule does not tell effects apart; the model does not describe the
 recordings from before a change."""
 
-SCHEMA = 7
+SCHEMA = 8
 """Version of the asset's format and of the features: weights belong to the features that they were
 fitted with, so an asset of another version is fitted again."""
 ASSET = Path(__file__).parents[1] / "assets" / "decision" / "decision.json"
@@ -109,7 +111,8 @@ class Feature:
     sign: int
     """+1: more of it makes the statement more probable; -1: less probable."""
     of: Callable[..., float]
-    """Computes it from the evidence; for `first` from an effect's evidence and all of it."""
+    """Computes it from the evidence; for `first` from an effect's evidence and all of it; for `two`
+    from the evidence and what `first` says (`shares_of`)."""
     meaning: str
     """What it is."""
 
@@ -316,6 +319,12 @@ def _least_unique(evidence: Evidence) -> float:
     pair = _pair(evidence)
     own = [each for each in evidence.effects if pair and each.effect in pair.effects]
     return min((_unique_share(each, evidence) for each in own), default=0.0)
+
+
+def _one_of_them(evidence: Evidence, shares: Mapping[str, float]) -> float:
+    """Log of the probability that one of the two proposed effects is missing, at least -4."""
+    pair = _pair(evidence)
+    return _log(sum(shares.get(name, 0.0) for name in pair.effects), -4.0, 0.0) if pair else -4.0
 
 
 def _leaves_more(effect: EffectEvidence, evidence: Evidence) -> float:
@@ -549,54 +558,63 @@ FIRST = (
 )
 TWO = (
     Feature(
+        "one_of_them",
+        +1,
+        _one_of_them,
+        "log of the probability by `first` that one of the two is missing",
+    ),
+    Feature(
         "better",
         +1,
-        _pair_better,
+        lambda e, shares: _pair_better(e),
         "log of what the best single effect leaves over what the two leave",
     ),
     Feature(
-        "last_z", +1, lambda e: _z(_last(e, "last_z")), "normal quantile of the second's p-value"
+        "last_z",
+        +1,
+        lambda e, shares: _z(_last(e, "last_z")),
+        "normal quantile of the second's p-value",
     ),
     Feature(
         "last_log_gain",
         +1,
-        lambda e: _between(_last(e, "last_log_gain"), 0.0, 1.0) * _beyond_form(e),
+        lambda e, shares: _between(_last(e, "last_log_gain"), 0.0, 1.0) * _beyond_form(e),
         "log gain of the second on top of the first, beyond what the form of the first gets wrong",
     ),
     Feature(
         "own_gain",
         +1,
-        lambda e: _between(_last(e, "own_gain"), 0.0, 1.0) * _beyond_form(e),
+        lambda e, shares: _between(_last(e, "own_gain"), 0.0, 1.0) * _beyond_form(e),
         "share that the second explains beside the relaxed form of the first, beyond its form",
     ),
     Feature(
         "own_log_gain",
         +1,
-        lambda e: _between(_last(e, "own_log_gain"), 0.0, 1.0) * _beyond_form(e),
+        lambda e, shares: _between(_last(e, "own_log_gain"), 0.0, 1.0) * _beyond_form(e),
         "log gain of the second there, beyond the form of the first",
     ),
     Feature(
         "instead_left",
         +1,
-        _instead_left,
+        lambda e, shares: _instead_left(e),
         "log of what is left with the best other effect in the place of one of the two",
     ),
     Feature(
         "instead_margin",
         +1,
-        lambda e: _between(_instead_margin(e), 0.0, 6.0) / 3.0,
+        lambda e, shares: _between(_instead_margin(e), 0.0, 6.0) / 3.0,
         "studentised log gain of the two over it",
     ),
     Feature(
         "unique",
         +1,
-        _least_unique,
+        lambda e, shares: _least_unique(e),
         "the lesser of the two effects' unique shares",
     ),
     Feature(
         "log_gain",
         -1,
-        lambda e: _between(e.effects[0].log_gain, 0.0, 2.0) if e.effects else 0.0,
+        lambda e, shares: _between(e.effects[0].log_gain, 0.0, 2.0) if e.effects else 0.0,
         "log gain of the best effect: the more there is to mend of its formula, the less a second "
         "one says",
     ),
@@ -736,9 +754,16 @@ def fitted_decision() -> DecisionModel:
     return load_decision()
 
 
-def features_of(name: str, evidence: Evidence) -> np.ndarray:
-    """(F,) features of a model; (E, F) for `first`, one row for each effect."""
+def features_of(
+    name: str, evidence: Evidence, shares: Mapping[str, float] | None = None
+) -> np.ndarray:
+    """(F,) features of a model; (E, F) for `first`, one row for each effect.
+
+    shares: what `first` says of the effects (`shares_of`), for `two`.
+    """
     some = FEATURES[name]
+    if name == "two":
+        return np.array([feature.of(evidence, shares or {}) for feature in some], float)
     if name == "first":
         rows = [[feature.of(each, evidence) for feature in some] for each in evidence.effects]
         return np.array(rows, float).reshape(len(rows), len(some))
@@ -771,6 +796,16 @@ class Probabilities:
         return sum(self.effects.values())
 
 
+def shares_of(evidence: Evidence, first: Logistic) -> dict[str, float]:
+    """Effect -> probability that it is missing, given that one effect of the list is; sums to 1."""
+    if not evidence.effects:
+        return {}
+    odds = first.log_odds(features_of("first", evidence))
+    share = np.exp(odds - odds.max())
+    share /= share.sum()
+    return {one.effect: float(p) for one, p in zip(evidence.effects, share, strict=True)}
+
+
 def _sigmoid(odds: float) -> float:
     return 1.0 / (1.0 + math.exp(-_between(odds, -500.0, 500.0)))
 
@@ -779,21 +814,18 @@ def probabilities(evidence: Evidence, model: DecisionModel | None = None) -> Pro
     """The probabilities of what is true, from the evidence."""
     model = model or fitted_decision()
 
+    each = shares_of(evidence, model.models["first"])
+
     def chance(name: str) -> float:
-        return _sigmoid(float(model.models[name].log_odds(features_of(name, evidence))))
+        return _sigmoid(float(model.models[name].log_odds(features_of(name, evidence, each))))
 
     missing = chance("missing")
     known = chance("known") if evidence.effects else 0.0
     network = 0.0 if evidence.paired else chance("network")
-    share = np.zeros(0)
-    if evidence.effects:
-        odds = model.models["first"].log_odds(features_of("first", evidence))
-        share = np.exp(odds - odds.max())
-        share /= share.sum()
-    each = {one.effect: float(p) for one, p in zip(evidence.effects, share, strict=True)}
-    pair = [one.effects for one in evidence.proposals if len(one.effects) == 2]
-    one = min(sum(each.get(name, 0.0) for name in pair[0]), 1.0) if pair else 0.0
-    both = one * chance("two") if pair else 0.0
+    pair = next((one.effects for one in evidence.proposals if len(one.effects) == 2), ())
+    both = chance("two") if pair else 0.0
+    one = max(sum(each.get(name, 0.0) for name in pair), LEAST_CHANCE)
+    each = {name: p * (1.0 - both + both * (name in pair) / one) for name, p in each.items()}
     ordered = sorted(each.items(), key=lambda item: -item[1])
     found = Probabilities(
         nothing=(1.0 - missing) * (1.0 - network),
@@ -801,7 +833,7 @@ def probabilities(evidence: Evidence, model: DecisionModel | None = None) -> Pro
         unknown=missing * (1.0 - known) * (1.0 - network),
         effects={name: missing * known * p for name, p in ordered},
         pair=missing * known * both,
-        two=pair[0] if pair else (),
+        two=pair,
     )
     return calibrated(found, model.curves)
 

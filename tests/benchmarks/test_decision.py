@@ -174,11 +174,18 @@ def test_how_often_pairs_were_drawn_does_not_count():
     assert weights[20:30].sum() / weights[20:].sum() == pytest.approx(PRIORS["two"])
 
 
-def test_two_effects_are_asked_about_where_one_of_them_is_missing():
+def test_two_effects_are_asked_about_wherever_an_effect_of_the_list_is_missing():
     pair = replace(GOOD, proposals=(ALONE, replace(ALONE, effects=("creep", "line_lag"))))
     truths = (("creep", "line_lag"), ("creep",), ("drift",), ("line_lag", "drift"))
-    some = sample("two", [case(n, truth=truth, evidence=pair) for n, truth in enumerate(truths)])
-    assert [(one.case, float(right)) for _, right, one in some] == [("0", 1), ("1", 0), ("3", 0)]
+    cases = [case(n, truth=truth, evidence=pair) for n, truth in enumerate(truths)]
+    cases.append(case(4, label="unknown", truth=(), evidence=pair))
+    first = Logistic((0.0,) * len(FEATURES["first"]))
+    some = sample("two", cases, first)
+    assert [(one.case, float(right)) for _, right, one in some] == [
+        ("0", 1), ("1", 0), ("2", 0), ("3", 0),
+    ]  # fmt: skip
+    place = [feature.name for feature in FEATURES["two"]].index("one_of_them")
+    assert [row[place] for row, _, _ in some] == [0.0] * 4, "creep or the lag, of these two"
 
 
 def test_a_calibration_gives_back_how_often_effects_are_missing():
@@ -328,7 +335,9 @@ def test_the_stored_evidence_gives_the_weights_of_the_asset(name):
     """At the penalties that the asset states. (L-BFGS ends within 0.01 of the least loss' weights
     on any processor.)"""
     one = json.loads(ASSET.read_text())["models"][name]
-    model = fit_one(name, sample(name, evidence()), one["penalty"], one["twin_weight"])
+    values = json.loads(ASSET.read_text())["models"]["first"]
+    first = Logistic(tuple(values["weights"].values()))
+    model = fit_one(name, sample(name, evidence(), first), one["penalty"], one["twin_weight"])
     assert model.constant == pytest.approx(one["constant"], abs=0.01)
     assert model.weights == pytest.approx(list(one["weights"].values()), abs=0.01)
 

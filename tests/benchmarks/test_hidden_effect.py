@@ -22,7 +22,7 @@ from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, save_model
 from surgisoft.tasks.registry import config_of, with_fields
 
-SMALL = StudyConfig(steps=3072, episodes=1, samples=1600)
+SMALL = StudyConfig(steps=3072, episodes=2, samples=1600)
 
 
 def nothing(done, total, note=""):

@@ -27,6 +27,7 @@ from surgisoft.diagnosis.decision import (
     of_change,
     probabilities,
     reason_of,
+    shares_of,
     statements,
 )
 from surgisoft.diagnosis.evidence import EffectEvidence, Evidence, ProposalEvidence
@@ -332,7 +333,10 @@ def test_how_sure_the_blocks_are_does_not_tell_two_apart_that_do_the_same():
 
 def test_a_second_effect_that_mends_the_form_of_the_first_says_nothing_of_two():
     """What is left of the first's 99 % is within what its form is wrong by; of 80 % it is not."""
-    second = replace(PAIR, own_gain=0.5, own_log_gain=0.7, own_z=3.3, last_log_gain=0.7)
+    second = replace(
+        PAIR, own_gain=0.5, own_log_gain=0.7, own_z=3.3, last_log_gain=0.7,
+        instead=("contact", "contact"), instead_left=(0.05, 0.05), instead_margin=(0.5, 0.5),
+    )  # fmt: skip
     names = [feature.name for feature in FEATURES["two"]]
     chances, rows = [], []
     for left in (0.01, 0.2):
@@ -562,6 +566,28 @@ def test_a_result_without_worth_is_not_told():
     sure = decide(GOOD, given_odds(missing=2.5, known=2.5, first=CLEAR), Worth(needless_name=-9.0))
     assert sure.kind == "cannot_tell"
     assert decide(GOOD, given_odds(missing=2.5, known=2.5, first=CLEAR)).kind == "identified"
+
+
+def test_two_effects_that_both_are_missing_stand_above_one_that_explains_much_of_both():
+    """By hand: alone 0.5, 0.3 and 0.2; with 0.8 both of the last two are, in shares 3 to 2.
+
+    0.5 x 0.2, 0.3 x 0.2 + 0.8 x 3/5, 0.2 x 0.2 + 0.8 x 2/5.
+    """
+    names = ("hysteresis", "creep", "payload")
+    left = [-math.log(chance) for chance in (0.5, 0.3, 0.2)]
+    effects = tuple(replace(CREEP, effect=name) for name in names)
+    two = math.log(0.8 / 0.2)
+    evidence = replace(GOOD, effects=effects, proposals=(ALONE, PAIR))
+    model = given_odds(missing=50.0, known=50.0, two=two)
+    first = Logistic(tuple(-1.0 if f.name == "amplitudes" else 0.0 for f in FEATURES["first"]))
+    sizes = [math.exp(each) - 1.0 for each in left]
+    sized = zip(effects, sizes, strict=True)
+    effects = tuple(replace(one, free_amplitudes=size) for one, size in sized)
+    model.models["first"] = first
+    found = probabilities(replace(evidence, effects=effects), model)
+    assert shares_of(replace(evidence, effects=effects), first)["creep"] == pytest.approx(0.3)
+    assert found.pair == pytest.approx(0.8)
+    assert found.effects == pytest.approx({"creep": 0.54, "payload": 0.36, "hysteresis": 0.1})
 
 
 def test_two_wrong_names_cost_what_one_costs():

@@ -69,10 +69,11 @@ def test_rows_of_a_reference_are_fitted_and_not_judged():
         one = cross_validated(features, residual, columns, block, two, size, noise)
         judged = fold == number
         np.testing.assert_allclose(found.grams[:, number], one.grams[:, 0], rtol=1e-5, atol=1e-4)
-        products = [each.held_out.among(np.arange(3)) for each in (found, one)]
-        np.testing.assert_allclose(
-            products[0][..., judged[:10]], products[1][..., judged], rtol=1e-4, atol=1e-4
-        )
+        for level in range(len(found.grams)):
+            products = [each.held_out.among(np.arange(3), level) for each in (found, one)]
+            np.testing.assert_allclose(
+                products[0][..., judged[:10]], products[1][..., judged], rtol=1e-4, atol=1e-4
+            )
 
 
 def test_command_takes_a_reference(model, tmp_path, capsys):

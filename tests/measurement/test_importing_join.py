@@ -175,6 +175,13 @@ def test_time_that_does_not_increase(tmp_path):
     assert "2 rows whose time does not increase left out" in part.notes[-1]
 
 
+def test_time_that_falls_back_is_late_until_it_passes_the_latest_one(tmp_path):
+    path = log(tmp_path, [0, 5, 2, 3, 6])
+    part = one(tmp_path, path, '[rows]\nrepeated_time = "drop"')
+    np.testing.assert_array_equal(part.recording.t_s, [0, 5, 6])
+    np.testing.assert_array_equal(part.recording.measured[:, 0], [0, 1, 4])
+
+
 def test_time_that_restarts_begins_a_run(tmp_path):
     part = one(tmp_path, log(tmp_path, [0, 1, 2, 0, 1, 0.5]), "[runs]\ntime_restarts = true")
     np.testing.assert_array_equal(part.recording.run, [0, 0, 0, 1, 1, 2])
@@ -183,6 +190,12 @@ def test_time_that_restarts_begins_a_run(tmp_path):
 def test_gap_in_time_begins_a_run(tmp_path):
     part = one(tmp_path, log(tmp_path, [0, 1, 2, 12, 13, 14.5]), "[runs]\ngap_s = 5")
     np.testing.assert_array_equal(part.recording.run, [0, 0, 0, 1, 1, 1])
+
+
+def test_gap_as_long_as_the_limit_begins_no_run(tmp_path):
+    """Rows one second apart are one run where gap_s is one second."""
+    part = one(tmp_path, log(tmp_path, [0, 1, 2, 3, 4.5]), "[runs]\ngap_s = 1")
+    np.testing.assert_array_equal(part.recording.run, [0, 0, 0, 0, 1])
 
 
 def test_column_of_texts_begins_a_run(tmp_path):
@@ -203,6 +216,14 @@ def test_rows_that_repeat_are_dropped_when_asked(tmp_path):
     assert one(tmp_path, path).recording.samples == 6
     part = one(tmp_path, path, '[rows]\nduplicates = "drop"')
     np.testing.assert_array_equal(part.recording.t_s, [0, 2, 3, 5])
+
+
+def test_first_row_of_a_run_repeats_no_row(tmp_path):
+    """A run may begin where the one before it ended."""
+    path = log(tmp_path, np.arange(4.0), u=[1, 2, 2, 2], x=[1, 2, 2, 2], label=list("aabb"))
+    part = one(tmp_path, path, '[rows]\nduplicates = "drop"\n[runs]\ncolumn = "label"')
+    np.testing.assert_array_equal(part.recording.t_s, [0, 1, 2])
+    np.testing.assert_array_equal(part.recording.run, [0, 0, 1])
 
 
 def test_stale_positions_are_missing_when_asked(tmp_path):

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from surgisoft.errors import InputError
-from surgisoft.rig.drivers.bench_map import KeyPoints, load_bench_map, map_of
+from surgisoft.rig.drivers.bench_map import BenchMap, KeyPoints, load_bench_map, map_of
+from surgisoft.rig.drivers.bench_map import FrameMap as BenchFrame
 from surgisoft.rig.drivers.clock import ClockMap
 from surgisoft.rig.drivers.line_protocol import Data, Info, crc16, line, words_of
 from surgisoft.rig.drivers.motion_capture import (
@@ -208,6 +210,16 @@ def test_a_map_puts_markers_into_the_arms_base_frame(tmp_path):
     np.testing.assert_allclose(points[2], [8.0, 0.0, -5.0], atol=1e-9)
     np.testing.assert_allclose(points[0], [0.0, 0.0, -5.0], atol=1e-9)
     np.testing.assert_allclose(points[1], [0.0, 0.0, -5.0], atol=1e-9)
+
+
+def test_three_turns_of_a_frame_are_about_fixed_axes_one_after_another():
+    """Against SciPy's extrinsic Euler angles; a point on the base's y axis, 20 mm from it."""
+    degrees, origin = (30.0, -50.0, 110.0), (7.0, -8.0, 9.0)
+    turn = Rotation.from_euler("xyz", degrees, degrees=True)
+    bench = BenchMap(("tip",), frame=BenchFrame(origin_mm=origin, rotation_deg=degrees))
+    at = np.array(origin) + turn.apply([0.0, 20.0, 0.0])
+    found = KeyPoints(bench)(Frame(1, 0.0, {"tip": at}, {}))
+    np.testing.assert_allclose(found, [[0.0, 20.0, 0.0]], atol=1e-12)
 
 
 def test_without_the_body_of_the_frame_nothing_is_known(tmp_path):

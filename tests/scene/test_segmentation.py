@@ -140,6 +140,20 @@ def test_the_headers_unit_counts(read, tmp_path):
     )
 
 
+def test_a_vessel_beside_the_organ_does_not_fill_its_notch(tmp_path):
+    """An L of 1 mm voxels with a block in its notch, which touches the walls of the L."""
+    labels = np.zeros((40, 40, 20), np.uint8)
+    labels[4:36, 4:36, 4:16] = 1
+    labels[20:36, 20:36] = 0
+    labels[20:32, 20:32, 4:16] = 2
+    path = write_nifti(tmp_path / "ct.nii", labels, np.eye(4))
+    found = read_segmentation(path, tuple(map(parse_label, ("1:organ:liver", "2:keep-out:vein"))))
+    organ = Mesh(found.parts[0].vertices, found.parts[0].faces)
+    assert organ.volume_mm3 == pytest.approx((labels == 1).sum(), rel=0.02)
+    inside = winding_numbers(organ, np.array([[12.0, 12.0, 10.0], [26.0, 26.0, 10.0]]))
+    np.testing.assert_allclose(inside, [1.0, 0.0], atol=1e-6)
+
+
 @pytest.mark.parametrize(("unit", "mm"), [("mm", 1.0), ("cm", 10.0), ("m", 1000.0)])
 @pytest.mark.parametrize(
     ("space", "to_right_anterior"),

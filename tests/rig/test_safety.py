@@ -181,6 +181,19 @@ def test_a_lost_sight_that_comes_back_goes_on():
     assert bench.vents == 0
 
 
+def test_time_in_a_wait_is_no_time_without_sight_or_command():
+    """Nobody looks and nobody commands while a program waits, three times as long as it may."""
+    bench = Valves()
+    rig = SafeRig(bench, Safety(rate=1e4, hold_ms=200.0, vent_ms=1000.0))
+    drive(rig, [[5.0, 5.0]])
+    rig.wait(3.0)
+    rig.command([9.0, 8.0])
+    assert (rig.counts["held"], bench.at.tolist()) == (0, [9.0, 8.0])
+    rig.wait(3.0)
+    rig.command([np.nan, 8.0])
+    assert (rig.counts["refused"], bench.at.tolist(), bench.vents) == (1, [9.0, 8.0], 0)
+
+
 def test_a_program_that_hangs_is_vented_by_the_watchdog():
     bench = Valves()
 
@@ -271,6 +284,32 @@ def test_the_first_reason_of_a_stop_counts_and_nothing_is_commanded_after_it():
         with pytest.raises(RigStopped, match="first"):
             call()
     assert (bench.vents, bench.sent) == (1, [])
+
+
+def test_a_stop_between_a_command_and_its_sending_sends_nothing():
+    """As by another thread: the clock is read after the command was accepted."""
+    bench, stops = Valves(), []
+
+    def clock():
+        for stop in stops:
+            stop("emergency stop by a key")
+        return 0.0
+
+    rig = SafeRig(bench, Safety(rate=1e4), clock=clock)
+    stops.append(rig.stop)
+    with pytest.raises(RigStopped, match="by a key"):
+        rig.command([20.0, 30.0])
+    assert (bench.vents, bench.sent, bench.at.tolist()) == (1, [], [0.0, 0.0])
+
+
+def test_a_stop_in_a_dry_run_touches_no_valve():
+    bench, shown = Valves(), []
+    rig = SafeRig(bench, show=shown.append)
+    rig.command([1.0, 1.0])
+    rig.stop("enough")
+    with pytest.raises(RigStopped, match="enough"):
+        rig.command([2.0, 2.0])
+    assert (bench.vents, bench.sent, len(shown)) == (0, [], 1)
 
 
 def test_a_signal_does_not_break_off_the_venting():

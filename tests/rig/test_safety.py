@@ -181,6 +181,32 @@ def test_a_lost_sight_that_comes_back_goes_on():
     assert bench.vents == 0
 
 
+def test_a_command_that_is_held_is_a_valid_one():
+    """0.9 s without sight, then 0.5 s without a finite command: neither lasts for a second."""
+    bench = Valves()
+    rig = SafeRig(bench, Safety(rate=1e4, hold_ms=200.0, vent_ms=1000.0))
+    drive(rig, [[5.0, 5.0]])
+    bench.points = np.full((1, 3), np.nan)
+    drive(rig, [[6.0, 6.0]] * 18)
+    bench.points = np.zeros((1, 3))
+    drive(rig, [[np.nan, 7.0]] * 10)
+    assert rig.counts["held"] >= 13
+    assert (bench.vents, bench.at.tolist()) == (0, [6.0, 6.0])
+
+
+def test_a_ramp_ends_with_a_reset():
+    bench = Valves()
+    rig = SafeRig(bench, Safety(rate=10.0))
+    drive(rig, [[40.0, 40.0]] * 3)
+    assert 0.0 < bench.at[0] < 40.0
+    rig.reset()
+    sent = len(bench.sent)
+    for _ in range(5):
+        rig.read()
+    rig.wait(1.0)
+    assert (bench.at.tolist(), len(bench.sent)) == ([0.0, 0.0], sent)
+
+
 def test_time_in_a_wait_is_no_time_without_sight_or_command():
     """Nobody looks and nobody commands while a program waits, three times as long as it may."""
     bench = Valves()

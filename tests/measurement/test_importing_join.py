@@ -235,6 +235,22 @@ def test_stale_positions_are_missing_when_asked(tmp_path):
     assert "k0 3, k1 3 of 7 rows" in part.notes[0]
 
 
+def test_positions_are_stale_after_the_row_before_in_their_file_alone(tmp_path):
+    """Row 2 lies in a gap of the valves' log and is left out: row 3 does not repeat row 1."""
+    x = np.array([1.0, 2.0, 7.0, 2.0, 2.0])
+    cells = np.column_stack([np.arange(5.0), x, 0 * x, 0 * x])
+    valves = [[0, 0], [1, 1], [3, 3], [4, 4]]
+    files = [
+        written(tmp_path / "pos.csv", text(cells, header=["t", "x", "y", "z"])),
+        written(tmp_path / "inp.csv", text(np.array(valves, float), header=["t", "u1"])),
+    ]
+    content = TWO.replace("OFFSET", 'join = "time"\ntime = "t"\nmax_gap_s = 1.5')
+    content = content.replace("rate_hz = 10", 'column = "t"').replace('["u1", "u2"]', '["u1"]')
+    (part,) = run(tmp_path, files, content + 'repeated = "missing"\n')
+    np.testing.assert_array_equal(part.recording.t_s, [0, 1, 3, 4])
+    np.testing.assert_array_equal(part.recording.key_points_mm[:, 0, 0], [1, 2, 2, np.nan])
+
+
 def test_steady_state_samples_are_the_means_of_their_rows(tmp_path):
     path = log(
         tmp_path,
@@ -250,6 +266,14 @@ def test_steady_state_samples_are_the_means_of_their_rows(tmp_path):
     np.testing.assert_allclose(recording.t_s, [0, 3.5, 5.5])
     np.testing.assert_allclose(recording.key_points_mm[:, 0, 0], [3, 4, 0])  # NaN is left out
     assert "7 rows averaged into 3 steady-state points" in part.notes[-1]
+
+
+def test_a_steady_state_ends_with_its_run(tmp_path):
+    """The same label on both sides of a gap: two points."""
+    path = log(tmp_path, [0, 1, 50, 51], u=[1, 3, 10, 20], label=list("aaaa"))
+    part = one(tmp_path, path, '[rows]\naverage = "label"\n[runs]\ngap_s = 9')
+    np.testing.assert_allclose(part.recording.measured[:, 0], [2, 15])
+    np.testing.assert_array_equal(part.recording.run, [0, 1])
 
 
 def test_frozen_rows_are_left_out_when_asked(tmp_path):

@@ -124,7 +124,7 @@ def test_the_pose_of_a_base_at_rest_is_that_of_the_first_rows(tmp_path):
 
 def test_key_points_are_lost_by_their_number_in_the_map(tmp_path):
     """The map's point 0, a dead marker, is the tip: the last one of the arm."""
-    t, points, _, room, _ = arm_in_a_room(2)
+    t, _, _, room, _ = arm_in_a_room(2)
     path = posed(tmp_path / "a.csv", t, room, np.zeros((len(t), 7)))
     content = POSED.replace("[frame]", "order = [1, 2, 0]\nlost = [0]\n[frame]")
     found = imported(tmp_path, path, content)[0].key_points_mm

@@ -16,7 +16,14 @@ from surgisoft.surrogate.history import pack
 from surgisoft.surrogate.interval import coverage_of
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import HawEnsemble, HawNN, range_weights, weighted_mse
-from surgisoft.surrogate.training import Data, make_rows, model_rows, normalise, rest_shape
+from surgisoft.surrogate.training import (
+    Data,
+    make_rows,
+    model_rows,
+    normalise,
+    rest_shape,
+    validated_error,
+)
 from surgisoft.surrogate.training import train as train_model
 from tests.surrogate.truth import SPEC, history, shape, traverse, walk
 
@@ -123,6 +130,17 @@ def test_a_block_of_rows_ends_with_its_run():
     block = make_rows(model, runs).block
     assert block.bincount().tolist() == [25, 25, 10, 25, 5]
     assert (block.diff() >= 0).all()
+
+
+def test_the_validated_error_counts_every_measured_key_point_once():
+    """Distances of 1, 1, 1 mm of one key point and of 3 mm of one that was seen once."""
+    target = torch.zeros(3, 2, 3)
+    predicted = torch.zeros(3, 2, 3)
+    predicted[:, 0, 0], predicted[:, 1, 1] = 1.0, 3.0
+    target[1:, 1] = torch.nan
+    found = validated_error(target, predicted)
+    assert found.rmse_mm == pytest.approx(np.sqrt((1 + 1 + 1 + 9) / 4))
+    assert found.per_key_point_mm == pytest.approx([1.0, 3.0])
 
 
 def test_same_seed_same_weights():

@@ -11,7 +11,7 @@ import pytest
 import torch
 from scipy.stats import binomtest
 
-from surgisoft.agents.evaluate import episode_table, student, summary, wilson
+from surgisoft.agents.evaluate import Evaluation, episode_table, student, summary, wilson
 from surgisoft.agents.exact_checks import Contact, EpisodeCheck
 from surgisoft.agents.rollout import Rollout
 from surgisoft.agents.session import EvaluationRequest, evaluate
@@ -126,6 +126,16 @@ def test_the_exact_checker_overrules_the_batched_path():
     assert table["success"].tolist() == [0.0, 1.0]
     assert table["collided"].tolist() == [1.0, 0.0]
     assert table["clearance_mm"].tolist() == [-0.5, 3.5]
+
+
+def test_the_exact_checks_of_all_episodes_are_sums_and_the_largest_differences():
+    one = EpisodeCheck(Contact(0.1, ("laser", "liver")), -0.5, 4, 1, 2.5, 2, 0.25, 3, 5, 1)
+    other = EpisodeCheck(None, 3.5, 3, 2, 0.5, 1, 0.75, 1, 2, 1)
+    told = Evaluation("p", {"success": np.zeros(2)}, {}, [one, other]).to_json()["exact_checks"]
+    assert (told["instants"], told["contact_differs"], told["beam_differs"]) == (7, 3, 3)
+    assert (told["beam_off_mm"], told["clearance_off_mm"]) == (0.75, 2.5)
+    assert (told["contact_asked"], told["beams_asked"], told["contact_audited"]) == (4, 7, 2)
+    assert told["contacts"] == [{"time_s": 0.1, "between": ["laser", "liver"]}, None]
 
 
 @pytest.fixture(scope="module")

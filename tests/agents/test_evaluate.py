@@ -16,6 +16,7 @@ from surgisoft.agents.exact_checks import Contact, EpisodeCheck
 from surgisoft.agents.rollout import Rollout
 from surgisoft.agents.session import EvaluationRequest, evaluate
 from surgisoft.cli import run
+from surgisoft.errors import Interrupted
 from surgisoft.scene.spec import PHANTOM
 from surgisoft.tasks.circle_ablation import CircleAblation
 from surgisoft.tasks.registry import make_task, read_config
@@ -144,6 +145,23 @@ def short(tmp_path_factory):
     file = tmp_path_factory.mktemp("config") / "short.toml"
     file.write_text("[follow]\nloop_s = 1.5\napproach_s = 0.5\nsize_mm = 2.0\n")
     return str(file)
+
+
+def test_the_episodes_of_an_interrupted_policy_bear_its_name(short, monkeypatch):
+    """Ctrl-C in the second policy, after the first of its two episodes."""
+    monkeypatch.setattr("surgisoft.agents.session.BATCH", 1)
+    interrupted = []
+
+    def stop(done, total, name):
+        if name == "random" and done > 0.8 * total and not interrupted:
+            interrupted.append(name)
+            raise KeyboardInterrupt
+
+    with pytest.raises(Interrupted) as ended:
+        evaluate(["scripted", "random"], "track_circle", config=short, episodes=2, progress=stop)
+    found = ended.value.result
+    assert [(one.policy, one.episodes) for one in found.results] == [("scripted", 2), ("random", 1)]
+    assert found.interruption == "interrupted; finished of 2 episodes each: scripted 2, random 1"
 
 
 def test_command_compares_policies_and_writes_all_numbers(tmp_path, capsys, short):

@@ -139,6 +139,19 @@ def test_a_condition_has_to_hold_without_a_break(cutting, base, spec):
     assert _walk(task, replace(state, goal=goal), 1, **good).phase.tolist() == [1, 1]
 
 
+@pytest.mark.parametrize(("seen", "reason", "phase"), [(1.0, 0, 1), (0.5, LATE, 2)])
+def test_a_condition_that_is_met_at_the_last_moment_is_in_time(
+    seen, reason, phase, cutting, base, spec
+):
+    """Two steps to hold it, and two steps of time."""
+    look = replace(spec.phases[0], until="centred", within=1000.0, hold_s=0.2, timeout_s=0.2)
+    look = replace(look, on_timeout="abort")
+    task = PhasedTask(LaserSupervision(base), replace(spec, phases=(look, spec.phases[1])))
+    state = replace(cutting[1], goal=replace(cutting[1].goal, phase=cutting[1].goal.phase * 0))
+    goal = _walk(task, state, 2, fraction=seen, clearance=20.0)
+    assert (goal.reason.tolist(), goal.phase.tolist()) == ([reason] * 2, [phase] * 2)
+
+
 def test_every_laser_has_to_be_out_and_the_endoscope_need_not():
     """Both lasers within 0.9 kPa of their start; the first, then the second one 1.1 kPa away; the
     endoscope 30 kPa away."""

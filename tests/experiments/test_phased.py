@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from surgisoft.agents.rollout import rollout
 from surgisoft.errors import InputError
 from surgisoft.experiments.controllers import (
     Schedule,
@@ -122,6 +123,8 @@ def test_an_abort_retreats_and_then_ends(cutting, base, spec):
     assert goal.phase.tolist() == [2, 2]
     state = replace(cutting[1], goal=goal)
     assert not task.released(_with(state, fraction=1.0)).any()
+    goal = _walk(task, state, 1, fraction=1.0, clearance=20.0)
+    assert (goal.reason.tolist(), goal.where.tolist()) == ([LOST] * 2, [1, 1]), "it stays aborted"
     goal = _walk(task, state, 2, fraction=1.0, clearance=20.0)
     assert goal.phase.tolist() == [3, 3]
     assert task.ended(replace(state, goal=goal)).all()
@@ -195,6 +198,20 @@ def test_a_lost_chamber_stops_the_beam_within_one_step(tmp_path):
     assert aborted == pytest.approx(0.1 * lost + 0.3, abs=0.11)
     assert row["beam_unsafe_longest_s"] <= 0.1 + 1e-6
     assert row["beam_s"] == pytest.approx(0.1 * log.beam.on.sum(), abs=1e-3)
+
+
+def test_the_longest_unsafe_time_is_one_without_a_break(tmp_path, monkeypatch):
+    """Five steps of 0.1 s: unsafe, unsafe, safe, unsafe, safe."""
+
+    def with_beam(*given):
+        found = rollout(*given)
+        found.measures["beam_unsafe"] = torch.tensor([[1.0, 1.0, 0.0, 1.0, 0.0]])
+        return found
+
+    monkeypatch.setattr("surgisoft.experiments.run.rollout", with_beam)
+    spec = load_experiment(write(tmp_path))
+    (row,) = roll_out_block(spec, settings(spec)[0], 0, 1).rows
+    assert row["beam_unsafe_longest_s"] == pytest.approx(0.2)
 
 
 def test_a_fault_needs_a_chamber_that_is_there(spec, base):

@@ -442,6 +442,28 @@ def test_gltf_comes_in_metres_with_y_up(tmp_path):
     assert any("y points up" in note for note in prepared.notes)
 
 
+def test_a_second_file_has_a_unit_and_an_up_of_its_own(tmp_path):
+    """An organ in mm with z up, and a vessel from a glTF file, in metres with y up."""
+    write_ply(ball(60.0, 3), tmp_path / "organ.ply")
+    shape = trimesh.creation.box((0.1, 0.04, 0.06))
+    shape.apply_translation((0.0, 0.2, 0.0))
+    shape.export(tmp_path / "vessel.glb")
+    files = tmp_path / "organ.ply", tmp_path / "vessel.glb"
+    organ, vessel = prepare(Request(files, ("organ", "keep-out"))).meshes
+    np.testing.assert_allclose(np.ptp(organ.bounds_mm, axis=0), 120.0, rtol=0.01)
+    np.testing.assert_allclose(vessel.bounds_mm, [[-50, -30, 180], [50, 30, 220]], atol=1e-3)
+
+
+def test_the_organ_is_the_largest_body_of_its_file(tmp_path):
+    small, large = (trimesh.creation.box((size,) * 3) for size in (20.0, 80.0))
+    small.apply_translation((90.0, 0.0, 0.0))
+    trimesh.util.concatenate([small, large]).export(tmp_path / "two.stl")
+    prepared = prepare(Request((tmp_path / "two.stl",), ("organ",), unit="mm"))
+    assert prepared.roles == ("organ", "keep-out")
+    sizes = [np.ptp(mesh.bounds_mm, axis=0)[0] for mesh in prepared.meshes]
+    assert sizes == pytest.approx([80.0, 20.0])
+
+
 def test_mounts_are_found_for_an_arm_of_another_length(tmp_path, monkeypatch, capsys):
     """The laser's arm is 120 mm long and bends as an arc; the endoscope's is the default one.
 

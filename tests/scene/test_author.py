@@ -21,6 +21,7 @@ from surgisoft.scene.author import (
     rounded_mount,
     write_scene,
 )
+from surgisoft.scene.camera import view
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.check import (
     REASONS,
@@ -213,6 +214,37 @@ def test_a_lesion_out_of_reach_is_told_why(made, tmp_path):
         "out of reach",
         "beam blocked",
     }
+
+
+def finding(verdict, what):
+    return next(each for each in verdict.findings if each.what == what)
+
+
+def test_a_camera_that_is_too_near_is_told(made, tmp_path):
+    """Sharp from 150 mm on, farther than the endoscope's arm stands from its lesion."""
+    camera = dataclasses.replace(open_scene(made[1]).spec.camera, range_mm=(150.0, 200.0))
+    scene = open_scene(scene_with(made, tmp_path, camera=camera))
+    found = finding(check_scene(scene, reaches_of(scene)), "camera to lesion")
+    assert float(found.value.split()[0]) < 150.0
+    assert (found.wanted, found.good) == ("150 to 200 mm", False)
+
+
+def test_the_worst_moment_of_the_view_counts(made, monkeypatch):
+    """The lasers hide the whole ring once, and never again."""
+    times = []
+
+    def hidden_once(caster, camera, pose, points, normals, arms=None):
+        seen = view(caster, camera, pose, points, normals, arms)
+        if arms is not None:
+            times.append(seen)
+        return dataclasses.replace(seen, visible=seen.visible & (len(times) != 2))
+
+    monkeypatch.setattr("surgisoft.scene.check.view", hidden_once)
+    scene = open_scene(made[1])
+    verdict = check_scene(scene, reaches_of(scene))
+    assert len(times) > 2
+    found = finding(verdict, "ring in view")
+    assert (found.value, found.good) == ("0 %", False)
 
 
 def test_a_lesion_off_the_organ_is_a_verdict(made, tmp_path, capsys):
@@ -455,10 +487,14 @@ def test_a_second_file_has_a_unit_and_an_up_of_its_own(tmp_path):
 
 
 def test_the_organ_is_the_largest_body_of_its_file(tmp_path):
-    small, large = (trimesh.creation.box((size,) * 3) for size in (20.0, 80.0))
-    small.apply_translation((90.0, 0.0, 0.0))
-    trimesh.util.concatenate([small, large]).export(tmp_path / "two.stl")
-    prepared = prepare(Request((tmp_path / "two.stl",), ("organ",), unit="mm"))
+    """A node of 20 mm comes before the organ of 80 mm."""
+    scene = trimesh.Scene()
+    for name, size, x in (("a", 0.02, 0.09), ("b", 0.08, 0.0)):
+        shape = trimesh.creation.box((size,) * 3)
+        shape.apply_translation((x, 0.0, 0.0))
+        scene.add_geometry(shape, node_name=name, geom_name=name)
+    scene.export(tmp_path / "two.glb")
+    prepared = prepare(Request((tmp_path / "two.glb",), ("organ",)))
     assert prepared.roles == ("organ", "keep-out")
     sizes = [np.ptp(mesh.bounds_mm, axis=0)[0] for mesh in prepared.meshes]
     assert sizes == pytest.approx([80.0, 20.0])

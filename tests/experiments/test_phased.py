@@ -214,6 +214,21 @@ def test_the_longest_unsafe_time_is_one_without_a_break(tmp_path, monkeypatch):
     assert row["beam_unsafe_longest_s"] == pytest.approx(0.2)
 
 
+@pytest.mark.parametrize(("steps", "vents"), [(16, False), (17, True)])
+def test_a_fault_comes_with_the_step_that_begins_at_its_time(steps, vents, cutting, base, spec):
+    """At 1.7 s, steps of 0.1 s: the step after the 17th is the first one without the valve."""
+    fault = Fault("endoscope", at_s=1.7, chamber=3)
+    task = PhasedTask(LaserSupervision(base), replace(spec, faults=(fault,)))
+    world = cutting[1].world
+    arm = world.arms["endoscope"]
+    arms = world.arms | {"endoscope": replace(arm, command=torch.full_like(arm.command, 5.0))}
+    world = replace(world, arms=arms, steps=torch.full_like(world.steps, steps))
+    still = {name: torch.zeros_like(each.command) for name, each in arms.items()}
+    after = task.advance(replace(cutting[1], world=world), still).world.arms["endoscope"].command
+    assert after[:, :2].tolist() == [[5.0, 5.0]] * 2
+    assert ((after[:, 2] < 5.0) == vents).all()
+
+
 def test_a_fault_needs_a_chamber_that_is_there(spec, base):
     wrong = replace(spec, faults=(Fault("laser", 1.0, 4),))
     with pytest.raises(InputError, match="chamber 4 of arm 'laser', expected 1 to 3"):

@@ -11,11 +11,12 @@ import pytest
 import torch
 from scipy.stats import binomtest
 
-from surgisoft.agents.evaluate import episode_table, student, summary, wilson
+from surgisoft.agents.evaluate import Evaluation, episode_table, student, summary, wilson
 from surgisoft.agents.exact_checks import Contact, EpisodeCheck
 from surgisoft.agents.rollout import Rollout
 from surgisoft.agents.session import EvaluationRequest, evaluate
 from surgisoft.cli import run
+from surgisoft.errors import Interrupted
 from surgisoft.scene.spec import PHANTOM
 from surgisoft.tasks.circle_ablation import CircleAblation
 from surgisoft.tasks.registry import make_task, read_config
@@ -128,12 +129,39 @@ def test_the_exact_checker_overrules_the_batched_path():
     assert table["clearance_mm"].tolist() == [-0.5, 3.5]
 
 
+def test_the_exact_checks_of_all_episodes_are_sums_and_the_largest_differences():
+    one = EpisodeCheck(Contact(0.1, ("laser", "liver")), -0.5, 4, 1, 2.5, 2, 0.25, 3, 5, 1)
+    other = EpisodeCheck(None, 3.5, 3, 2, 0.5, 1, 0.75, 1, 2, 1)
+    told = Evaluation("p", {"success": np.zeros(2)}, {}, [one, other]).to_json()["exact_checks"]
+    assert (told["instants"], told["contact_differs"], told["beam_differs"]) == (7, 3, 3)
+    assert (told["beam_off_mm"], told["clearance_off_mm"]) == (0.75, 2.5)
+    assert (told["contact_asked"], told["beams_asked"], told["contact_audited"]) == (4, 7, 2)
+    assert told["contacts"] == [{"time_s": 0.1, "between": ["laser", "liver"]}, None]
+
+
 @pytest.fixture(scope="module")
 def short(tmp_path_factory):
     """A task that is over in two seconds."""
     file = tmp_path_factory.mktemp("config") / "short.toml"
     file.write_text("[follow]\nloop_s = 1.5\napproach_s = 0.5\nsize_mm = 2.0\n")
     return str(file)
+
+
+def test_the_episodes_of_an_interrupted_policy_bear_its_name(short, monkeypatch):
+    """Ctrl-C in the second policy, after the first of its two episodes."""
+    monkeypatch.setattr("surgisoft.agents.session.BATCH", 1)
+    interrupted = []
+
+    def stop(done, total, name):
+        if name == "random" and done > 0.8 * total and not interrupted:
+            interrupted.append(name)
+            raise KeyboardInterrupt
+
+    with pytest.raises(Interrupted) as ended:
+        evaluate(["scripted", "random"], "track_circle", config=short, episodes=2, progress=stop)
+    found = ended.value.result
+    assert [(one.policy, one.episodes) for one in found.results] == [("scripted", 2), ("random", 1)]
+    assert found.interruption == "interrupted; finished of 2 episodes each: scripted 2, random 1"
 
 
 def test_command_compares_policies_and_writes_all_numbers(tmp_path, capsys, short):

@@ -130,6 +130,19 @@ def test_training_ends_with_the_evaluation_whose_error_is_low_enough(limit, turn
     assert signal.getsignal(signal.SIGINT) is before
 
 
+@pytest.mark.parametrize(("success", "turns"), [(1.0, 2), (0.9, 4)])
+def test_a_low_error_ends_training_only_where_every_episode_succeeds(
+    success, turns, tmp_path, monkeypatch
+):
+    def succeeding(*given):
+        found, log = evaluate_checkpoint(*given)
+        return found | {"success": success}, log
+
+    monkeypatch.setattr("surgisoft.agents.training.evaluate_checkpoint", succeeding)
+    found = train_new(tmp_path / "run", plan_of(target_error=1e9), Processes(), CPU)
+    assert found.steps == turns * TINY.envs * TINY.rollout
+
+
 def test_a_second_ctrl_c_ends_training_at_once(tmp_path):
     before = signal.getsignal(signal.SIGINT)
 

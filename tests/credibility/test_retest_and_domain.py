@@ -87,6 +87,13 @@ def test_each_quantity_can_take_a_state_out():
     assert found.whole == pytest.approx(0.4)
 
 
+def test_a_rate_counts_whichever_way_it_goes():
+    """Fastest in emptying: 8 units a second; filling may be as fast, but for a twentieth."""
+    known = states([[0.0], [10.0]], [[2.0], [-8.0]])
+    found = applicability([known], [states([[0.0]] * 3, [[8.3], [8.5], [-8.3]])], 70.0)
+    assert found.inside.tolist() == [True, False, True]
+
+
 def test_rates_are_taken_over_half_a_second():
     t_s = 0.1 * np.arange(21)
     assert np.allclose(rates(t_s, 3.0 * t_s[:, None]), 3.0)

@@ -65,6 +65,18 @@ def test_inputs_go_through_the_slope_and_noise_has_three_coordinates():
     assert found.body.input_mm == pytest.approx(0.2 / np.sqrt(2.0), rel=1e-3)
 
 
+def test_a_sensor_that_is_off_was_off_before_the_recording_too():
+    """An arm that follows in an hour and has stood for long: 2 mm/kPa at once in every row."""
+    rest = torch.zeros(2)
+    facts = ArmFacts(rest, torch.full((2,), 10.0), rest, REST)
+    lag = make_effect("line_lag", facts, up_s=3600.0, down_s=3600.0, dead_s=1e-4, turn=1e6)
+    lag.amplitudes()["share"].data.fill_(1.0)
+    slow = model(linear_network(2.0)).replace(effects={"line_lag": lag})
+    some = [dataclasses.replace(recording(), measured=np.full((240, 2), 5.0))]
+    found = budget(residual_table(slow, some), some, Uncertainty(input=(0.1,)))
+    assert found.per_key_point[1].input_mm == pytest.approx(0.2, rel=1e-3)
+
+
 def test_steps_of_time_are_as_uncertain_as_halving_them_says():
     """A lag of 0.5 s on a ramp of 0.5 kPa/s: held commands lag by a r h / (1 - a), a = e^(-h/tau).
 

@@ -60,6 +60,15 @@ def test_a_marker_that_slips_is_found_where_and_when_it_does():
     assert found.clarity == pytest.approx(np.sqrt(found.share) * found.log_gain)
 
 
+def test_the_share_of_a_slip_is_one_of_what_is_above_the_noise():
+    """Noise of 0.15 mm in each of nine coordinates beside a slip of half a millimetre."""
+    noise = np.random.default_rng(5).normal(0.0, 0.15, (ROWS, 3, 3))
+    made = moved_by(shifted(1, 800, np.array([0.3, 0.0, 0.4])) + noise)
+    found = key_point_shift(problem_of(still_model(), [replace(made, noise_mm=0.15)]))
+    whole = 0.25 / 2.0  # half of the rows are moved by 0.5 mm
+    assert found.share == pytest.approx(0.25 / 4.0 / whole, rel=0.2)
+
+
 def test_a_slip_is_seen_beside_motion_that_no_actuation_explains():
     """The body wanders by more than the marker slips; its neighbours say so."""
     time = PERIOD_S * np.arange(ROWS)

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from surgisoft.cli import run
-from surgisoft.diagnosis.amend import Fall, amend, fall_of
+from surgisoft.diagnosis.amend import Fall, amend, fall_of, track_of
 from surgisoft.diagnosis.compare import compare
 from surgisoft.diagnosis.estimation.network import Retuned, retune
 from surgisoft.diagnosis.residuals import held_out_rows, problem_of, residual_table
@@ -21,6 +21,7 @@ from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import Recording, load_recording, save_recording
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
+from tests.diagnosis.synthetic import recording, still_model, walk
 from tests.diagnosis.test_estimation import TRUTHS, bare_arm, measured_on
 
 
@@ -40,6 +41,20 @@ def hashes(folder) -> dict[str, str]:
         for path in sorted(folder.rglob("*"))
         if path.is_file()
     }
+
+
+def test_a_track_begins_anew_with_every_run():
+    """Two recordings, the second one of two runs: three begins, the first row among them."""
+    first, second = recording(np.zeros(60), walk(60)), recording(np.zeros(80), walk(80), seed=2)
+    second = replace(second, run=np.repeat([4, 7], 40))
+    problem = problem_of(still_model(), [first, second])
+    track = track_of(problem, problem)
+    row = problem.index.numpy()
+    table = problem.table
+    runs = np.stack([table.recording[row], table.run[row]], axis=1)
+    expected = np.r_[True, (np.diff(runs, axis=0) != 0).any(axis=1)]
+    np.testing.assert_array_equal(track.start, expected)
+    assert (track.start[0], track.start.sum()) == (True, 3)
 
 
 def test_a_fall_by_hand():

@@ -54,6 +54,18 @@ def test_errors_by_hand():
     assert result.worst[0].key_point == 2
 
 
+def test_the_worst_moments_are_apart():
+    """Three peaks over several rows each: no two moments of one, within a fiftieth of the rows."""
+    rows = np.arange(500)
+    points = np.tile(POINTS, (500, 1, 1))
+    for peak, size in ((100, 9.0), (250, 7.0), (400, 8.0)):
+        points[:, 2, 2] += size * np.clip(1.0 - np.abs(rows - peak) / 8.0, 0.0, None)
+    result, _ = compare(still_model(), [recording(points)])
+    first = result.worst[:3]
+    assert [round(10 * moment.t_s) for moment in first] == [100, 400, 250]
+    assert [moment.error_mm for moment in first] == pytest.approx([9.0, 8.0, 7.0])
+
+
 def test_the_coverage_of_the_models_interval_is_stated():
     """Radii 1, 6 and 10 mm: k0 exact, k1 off by 5, the tip off by 12 in two of four rows."""
     points = np.tile(POINTS, (4, 1, 1))

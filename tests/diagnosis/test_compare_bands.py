@@ -66,6 +66,21 @@ def test_a_late_arm_is_told_its_delay():
     assert shift.ci95_s == pytest.approx((shift.seconds, shift.seconds))
 
 
+def test_a_delay_is_that_within_runs():
+    """Runs of 25 rows that each begin elsewhere: what lies between two of them is no motion.
+
+    Along x at 10 mm/s, the arm 0.1 s late; from run to run the prediction jumps by 500 mm.
+    """
+    runs = [recording(np.zeros(25), walk(25), seed=k) for k in range(20)]
+    problem = problem_of(still_model(), runs)
+    table = problem.table
+    along = table.t_s + 50.0 * (table.recording % 2)
+    predicted = POINTS + 10.0 * along[:, None, None] * np.array([1.0, 0.0, 0.0])
+    late = replace(table, predicted_mm=predicted, measured_mm=predicted - [1.0, 0.0, 0.0])
+    shift = time_shift(late, problem.block_of_row)
+    assert shift.seconds == pytest.approx(0.1, rel=1e-6)
+
+
 def test_command_says_the_verdict_first_and_writes_all(tmp_path, capsys):
     pressure = walk(300)
     save_model(still_model(), tmp_path / "model")

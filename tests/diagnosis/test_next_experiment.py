@@ -73,6 +73,11 @@ def test_every_figure_stays_in_range_and_lasts_its_time(name, limits):
     np.testing.assert_array_equal(rows, again[1])
 
 
+def test_every_run_has_its_rest():
+    """Runs of two minutes, half a minute of rest before each."""
+    assert [bench_minutes(runs) for runs in (1, 2, 4)] == [2.5, 5.0, 10.0]
+
+
 def test_commands_keep_clear_of_the_ends_of_the_arms_range(arm):
     limits = limits_within(arm.spec.low, arm.spec.high)
     assert (limits[:, 0] > np.array(arm.spec.low)).all()

@@ -56,6 +56,13 @@ def test_several_directions_are_told_and_no_load_is_freed(arm, turned):
     assert "one direction at a time" in notes[-1]
 
 
+def test_beside_an_unknown_direction_no_load_is_freed(arm, turned):
+    """The bench of the second recording may stand as where the model was fitted."""
+    model, notes = under_weight(arm, [turned, replace(turned, gravity=None)])
+    assert model is arm
+    assert "several or unknown directions of weight" in notes[-1]
+
+
 def test_own_weight_of_a_rolled_arm_is_called_a_load(arm, turned, tmp_path):
     """Truth: nothing but gravity's direction differs from where the model was fitted."""
     model, _ = under_weight(arm, [turned])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from surgisoft.agents.rollout import rollout
 from surgisoft.errors import InputError
 from surgisoft.experiments.controllers import (
     Schedule,
@@ -122,6 +123,8 @@ def test_an_abort_retreats_and_then_ends(cutting, base, spec):
     assert goal.phase.tolist() == [2, 2]
     state = replace(cutting[1], goal=goal)
     assert not task.released(_with(state, fraction=1.0)).any()
+    goal = _walk(task, state, 1, fraction=1.0, clearance=20.0)
+    assert (goal.reason.tolist(), goal.where.tolist()) == ([LOST] * 2, [1, 1]), "it stays aborted"
     goal = _walk(task, state, 2, fraction=1.0, clearance=20.0)
     assert goal.phase.tolist() == [3, 3]
     assert task.ended(replace(state, goal=goal)).all()
@@ -137,6 +140,19 @@ def test_a_condition_has_to_hold_without_a_break(cutting, base, spec):
     goal = _walk(task, replace(state, goal=goal), 1, **good)
     assert goal.phase.tolist() == [0, 0]
     assert _walk(task, replace(state, goal=goal), 1, **good).phase.tolist() == [1, 1]
+
+
+@pytest.mark.parametrize(("seen", "reason", "phase"), [(1.0, 0, 1), (0.5, LATE, 2)])
+def test_a_condition_that_is_met_at_the_last_moment_is_in_time(
+    seen, reason, phase, cutting, base, spec
+):
+    """Two steps to hold it, and two steps of time."""
+    look = replace(spec.phases[0], until="centred", within=1000.0, hold_s=0.2, timeout_s=0.2)
+    look = replace(look, on_timeout="abort")
+    task = PhasedTask(LaserSupervision(base), replace(spec, phases=(look, spec.phases[1])))
+    state = replace(cutting[1], goal=replace(cutting[1].goal, phase=cutting[1].goal.phase * 0))
+    goal = _walk(task, state, 2, fraction=seen, clearance=20.0)
+    assert (goal.reason.tolist(), goal.phase.tolist()) == ([reason] * 2, [phase] * 2)
 
 
 def test_every_laser_has_to_be_out_and_the_endoscope_need_not():
@@ -182,6 +198,35 @@ def test_a_lost_chamber_stops_the_beam_within_one_step(tmp_path):
     assert aborted == pytest.approx(0.1 * lost + 0.3, abs=0.11)
     assert row["beam_unsafe_longest_s"] <= 0.1 + 1e-6
     assert row["beam_s"] == pytest.approx(0.1 * log.beam.on.sum(), abs=1e-3)
+
+
+def test_the_longest_unsafe_time_is_one_without_a_break(tmp_path, monkeypatch):
+    """Five steps of 0.1 s: unsafe, unsafe, safe, unsafe, safe."""
+
+    def with_beam(*given):
+        found = rollout(*given)
+        found.measures["beam_unsafe"] = torch.tensor([[1.0, 1.0, 0.0, 1.0, 0.0]])
+        return found
+
+    monkeypatch.setattr("surgisoft.experiments.run.rollout", with_beam)
+    spec = load_experiment(write(tmp_path))
+    (row,) = roll_out_block(spec, settings(spec)[0], 0, 1).rows
+    assert row["beam_unsafe_longest_s"] == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(("steps", "vents"), [(16, False), (17, True)])
+def test_a_fault_comes_with_the_step_that_begins_at_its_time(steps, vents, cutting, base, spec):
+    """At 1.7 s, steps of 0.1 s: the step after the 17th is the first one without the valve."""
+    fault = Fault("endoscope", at_s=1.7, chamber=3)
+    task = PhasedTask(LaserSupervision(base), replace(spec, faults=(fault,)))
+    world = cutting[1].world
+    arm = world.arms["endoscope"]
+    arms = world.arms | {"endoscope": replace(arm, command=torch.full_like(arm.command, 5.0))}
+    world = replace(world, arms=arms, steps=torch.full_like(world.steps, steps))
+    still = {name: torch.zeros_like(each.command) for name, each in arms.items()}
+    after = task.advance(replace(cutting[1], world=world), still).world.arms["endoscope"].command
+    assert after[:, :2].tolist() == [[5.0, 5.0]] * 2
+    assert ((after[:, 2] < 5.0) == vents).all()
 
 
 def test_a_fault_needs_a_chamber_that_is_there(spec, base):

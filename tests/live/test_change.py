@@ -142,6 +142,39 @@ def test_sample_by_sample_is_the_cusum_of_the_block_means(detector):
     np.testing.assert_allclose(levels[20::10][: len(expected)], expected[: len(levels[20::10])])
 
 
+def test_a_key_point_that_is_lost_for_whole_blocks_keeps_its_last_mean(detector):
+    """Four blocks of 0.5 s, ten samples each, without key point 0, which is 2 mm off all along."""
+    t_s, values = residual(20, 13)
+    values[:, 0] += 2.0
+    lost, held = values.copy(), values.copy()
+    lost[200:240, 0] = np.nan
+    held[200:240, 0] = values[190:200, 0].mean(axis=0)
+    _, levels = fed(detector, t_s, lost)
+    _, expected = fed(detector, t_s, held)
+    assert expected[250] > 0.0
+    np.testing.assert_allclose(levels, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("reset", [True, False])
+def test_a_reset_and_a_gap_begin_anew(detector, reset):
+    """A part of a block before them, with a wrong error, leaves no trace."""
+    t_s, values = residual(20, 14)
+    plain, levels = fed(detector, t_s + 100.0, values)
+    charts = Charts(detector)
+    for at_s in (0.0, 0.1, 0.2):
+        charts.update(at_s, np.full((N, 3), 7.0), waves(np.array([50.0]))[0])
+    if reset:
+        charts.pause()
+    begin_s = 0.3 if reset else 100.0
+    again = [
+        (charts.update(begin_s + at_s, value, actuation), charts.statistic)[1]
+        for at_s, value, actuation in zip(t_s, values, waves(t_s + 100.0), strict=True)
+    ]
+    np.testing.assert_allclose(again, levels, rtol=1e-9)
+    assert levels.max() > 0.0
+    assert charts.judged == plain.judged
+
+
 def test_an_error_that_stands_while_the_arm_does_counts_once():
     """Five minutes at one place where a clean model errs by four times its usual error: one value.
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from surgisoft.measurement.histories import history_of
+from surgisoft.measurement.histories import actuation_noise, history_of
 from surgisoft.measurement.recordings import Recording
 
 
@@ -47,3 +47,15 @@ def test_runs_know_where_the_measured_actuation_stood_when_they_began():
     assert history.select(torch.tensor([1])).stood.tolist() == [[3.0]]
     commanded = replace(first, commanded=first.measured + 50)
     assert history_of([commanded], "commanded").stood.tolist() == [[0.0], [3.0]]
+
+
+def test_a_step_from_run_to_run_is_no_noise():
+    """Thirty runs of two rows, each beginning where the last one ended: steps of 0.1, 0.2, 0.3."""
+    steps = np.tile([0.1, 0.2, 0.3], 10)
+    ends = np.cumsum(steps * np.tile([1, -1], 15))
+    measured = np.stack([np.concatenate([[0.0], ends[:-1]]), ends], axis=1).reshape(60, 1)
+    measured = np.concatenate([measured, [[50.0], [51.5]]])  # the range, in a run of its own
+    run = np.repeat(np.arange(31), 2)
+    made = Recording("pairs", np.arange(62.0), measured, np.zeros((62, 1, 3)), run=run)
+    expected = 1.4826 * 0.2 / np.sqrt(2)
+    np.testing.assert_allclose(actuation_noise(made), [expected], rtol=1e-6)

@@ -90,6 +90,48 @@ def test_constant_rotation_and_origin(tmp_path_factory, seed):
     )
 
 
+@pytest.mark.parametrize("mode", ["fixed", "rest", "moving"])
+def test_base_origin_and_rotation_follow_one_another(tmp_path, mode):
+    """A body beside the arm's base, turned against it, in a file in cm.
+
+    What the body sees of an arm at p is turn^-1 p + origin, and the room turns that again.
+    """
+    t, points, mount, _, _ = arm_in_a_room(3)
+    turn, origin_mm = Rotation.from_euler("xyz", [20, -70, 130], degrees=True), [3.0, -40.0, 12.0]
+    seen = turn.inv().apply(points.reshape(-1, 3)) + origin_mm
+    room = mount.apply(seen).reshape(points.shape) + 500.0
+    pose = np.tile([50.0, 50.0, 50.0, *mount.as_quat()], (len(t), 1))
+    path = posed(tmp_path / "a.csv", t, room / 10.0, pose)
+    frame = f"rotation = {turn.as_matrix().tolist()}\norigin = [0.3, -4.0, 1.2]\n"
+    content = POSED.replace('unit = "mm"', 'unit = "cm"') + frame + f'{BODY}mode = "{mode}"\n'
+    recording, _ = imported(tmp_path, path, content)
+    np.testing.assert_allclose(recording.key_points_mm, points, atol=1e-9)
+    expected = turn.apply(mount.inv().apply([0, -1, 0]))
+    np.testing.assert_allclose(recording.gravity, expected, atol=1e-12)
+
+
+def test_the_pose_of_a_base_at_rest_is_that_of_the_first_rows(tmp_path):
+    """The holder yields after five rows: its mean over all rows is another frame."""
+    t, points, mount, room, _ = arm_in_a_room(8)
+    later = Rotation.from_rotvec([0.0, 0.3, 0.0]) * mount
+    pose = np.tile([500.0, 500.0, 500.0, *mount.as_quat()], (len(t), 1))
+    pose[5:] = [530.0, 500.0, 470.0, *later.as_quat()]
+    path = posed(tmp_path / "a.csv", t, room, pose)
+    content = f'{POSED}rest_rows = 5\n{BODY}mode = "rest"\n'
+    recording, _ = imported(tmp_path, path, content)
+    np.testing.assert_allclose(recording.key_points_mm, points, atol=1e-9)
+
+
+def test_key_points_are_lost_by_their_number_in_the_map(tmp_path):
+    """The map's point 0, a dead marker, is the tip: the last one of the arm."""
+    t, _, _, room, _ = arm_in_a_room(2)
+    path = posed(tmp_path / "a.csv", t, room, np.zeros((len(t), 7)))
+    content = POSED.replace("[frame]", "order = [1, 2, 0]\nlost = [0]\n[frame]")
+    found = imported(tmp_path, path, content)[0].key_points_mm
+    np.testing.assert_allclose(found[:, :2], room[:, 1:], atol=1e-9)
+    assert np.isnan(found[:, 2]).all()
+
+
 @given(seed=st.integers(0, 2**32))
 def test_frame_from_the_arm_at_rest(tmp_path_factory, seed):
     """With origin k0 and z along the arm at rest, any mount gives the same up to heading."""

@@ -175,6 +175,13 @@ def test_time_that_does_not_increase(tmp_path):
     assert "2 rows whose time does not increase left out" in part.notes[-1]
 
 
+def test_time_that_falls_back_is_late_until_it_passes_the_latest_one(tmp_path):
+    path = log(tmp_path, [0, 5, 2, 3, 6])
+    part = one(tmp_path, path, '[rows]\nrepeated_time = "drop"')
+    np.testing.assert_array_equal(part.recording.t_s, [0, 5, 6])
+    np.testing.assert_array_equal(part.recording.measured[:, 0], [0, 1, 4])
+
+
 def test_time_that_restarts_begins_a_run(tmp_path):
     part = one(tmp_path, log(tmp_path, [0, 1, 2, 0, 1, 0.5]), "[runs]\ntime_restarts = true")
     np.testing.assert_array_equal(part.recording.run, [0, 0, 0, 1, 1, 2])
@@ -183,6 +190,12 @@ def test_time_that_restarts_begins_a_run(tmp_path):
 def test_gap_in_time_begins_a_run(tmp_path):
     part = one(tmp_path, log(tmp_path, [0, 1, 2, 12, 13, 14.5]), "[runs]\ngap_s = 5")
     np.testing.assert_array_equal(part.recording.run, [0, 0, 0, 1, 1, 1])
+
+
+def test_gap_as_long_as_the_limit_begins_no_run(tmp_path):
+    """Rows one second apart are one run where gap_s is one second."""
+    part = one(tmp_path, log(tmp_path, [0, 1, 2, 3, 4.5]), "[runs]\ngap_s = 1")
+    np.testing.assert_array_equal(part.recording.run, [0, 0, 0, 0, 1])
 
 
 def test_column_of_texts_begins_a_run(tmp_path):
@@ -205,6 +218,14 @@ def test_rows_that_repeat_are_dropped_when_asked(tmp_path):
     np.testing.assert_array_equal(part.recording.t_s, [0, 2, 3, 5])
 
 
+def test_first_row_of_a_run_repeats_no_row(tmp_path):
+    """A run may begin where the one before it ended."""
+    path = log(tmp_path, np.arange(4.0), u=[1, 2, 2, 2], x=[1, 2, 2, 2], label=list("aabb"))
+    part = one(tmp_path, path, '[rows]\nduplicates = "drop"\n[runs]\ncolumn = "label"')
+    np.testing.assert_array_equal(part.recording.t_s, [0, 1, 2])
+    np.testing.assert_array_equal(part.recording.run, [0, 0, 1])
+
+
 def test_stale_positions_are_missing_when_asked(tmp_path):
     path = log(tmp_path, np.arange(7.0), x=[1, 1, 1, 2, 3, 3, 1])
     assert not np.isnan(one(tmp_path, path).recording.key_points_mm).any()
@@ -212,6 +233,22 @@ def test_stale_positions_are_missing_when_asked(tmp_path):
     lost = np.isnan(part.recording.key_points_mm).any(axis=2)
     np.testing.assert_array_equal(lost, np.array([[0, 1, 1, 0, 0, 1, 0]] * 2, bool).T)
     assert "k0 3, k1 3 of 7 rows" in part.notes[0]
+
+
+def test_positions_are_stale_after_the_row_before_in_their_file_alone(tmp_path):
+    """Row 2 lies in a gap of the valves' log and is left out: row 3 does not repeat row 1."""
+    x = np.array([1.0, 2.0, 7.0, 2.0, 2.0])
+    cells = np.column_stack([np.arange(5.0), x, 0 * x, 0 * x])
+    valves = [[0, 0], [1, 1], [3, 3], [4, 4]]
+    files = [
+        written(tmp_path / "pos.csv", text(cells, header=["t", "x", "y", "z"])),
+        written(tmp_path / "inp.csv", text(np.array(valves, float), header=["t", "u1"])),
+    ]
+    content = TWO.replace("OFFSET", 'join = "time"\ntime = "t"\nmax_gap_s = 1.5')
+    content = content.replace("rate_hz = 10", 'column = "t"').replace('["u1", "u2"]', '["u1"]')
+    (part,) = run(tmp_path, files, content + 'repeated = "missing"\n')
+    np.testing.assert_array_equal(part.recording.t_s, [0, 1, 3, 4])
+    np.testing.assert_array_equal(part.recording.key_points_mm[:, 0, 0], [1, 2, 2, np.nan])
 
 
 def test_steady_state_samples_are_the_means_of_their_rows(tmp_path):
@@ -229,6 +266,14 @@ def test_steady_state_samples_are_the_means_of_their_rows(tmp_path):
     np.testing.assert_allclose(recording.t_s, [0, 3.5, 5.5])
     np.testing.assert_allclose(recording.key_points_mm[:, 0, 0], [3, 4, 0])  # NaN is left out
     assert "7 rows averaged into 3 steady-state points" in part.notes[-1]
+
+
+def test_a_steady_state_ends_with_its_run(tmp_path):
+    """The same label on both sides of a gap: two points."""
+    path = log(tmp_path, [0, 1, 50, 51], u=[1, 3, 10, 20], label=list("aaaa"))
+    part = one(tmp_path, path, '[rows]\naverage = "label"\n[runs]\ngap_s = 9')
+    np.testing.assert_allclose(part.recording.measured[:, 0], [2, 15])
+    np.testing.assert_array_equal(part.recording.run, [0, 1])
 
 
 def test_frozen_rows_are_left_out_when_asked(tmp_path):

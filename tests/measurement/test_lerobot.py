@@ -166,6 +166,18 @@ def test_commands_write_and_import_a_dataset(tmp_path, capsys):
     np.testing.assert_allclose(load_recording(back).measured, recording().measured, atol=1e-5)
 
 
+def test_a_gap_is_measured_in_the_longer_one_of_both_steps(tmp_path):
+    """100 samples per second, 0.1 s of them lost: at 10 frames per second none is missing."""
+    t_s = np.delete(np.arange(101) / 100, slice(40, 50))
+    points = np.stack([t_s, 0 * t_s, 0 * t_s], axis=1)[:, None]
+    made = Recording("fast", t_s, t_s[:, None], points)
+    notes = save_lerobot([made], tmp_path / "set", fps=10)
+    read = load_lerobot(tmp_path / "set")
+    assert not any("gaps" in note for note in notes)
+    np.testing.assert_array_equal(read.run, np.zeros(11))
+    np.testing.assert_allclose(read.measured[:, 0], np.arange(11) / 10, atol=1e-6)
+
+
 def test_uneven_times_are_put_on_the_grid(tmp_path):
     t_s = np.array([0.0, 0.04, 0.11, 0.15, 0.2, 1.2, 1.25, 1.3])
     points = np.zeros((8, 1, 3))

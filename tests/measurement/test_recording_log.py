@@ -77,6 +77,37 @@ def test_a_torn_log_opens_and_says_what_is_missing(tmp_path, capsys):
         assert load_recording(log).samples == 2
 
 
+def _log(path, commands=((1.0,), (2.0,)), rows=(0, 1)):
+    """A log of samples of one chamber, one by one."""
+    header = LogHeader("n", "settled", "kPa", 1, 1, ArmInfo(), rows=rows[-1] + 1)
+    with recording_log(path, header) as log:
+        for number, (row, command) in enumerate(zip(rows, commands, strict=True)):
+            log.sample(row, 0, 0.1 * number, np.ones(1), np.ones((1, 3)), np.array(command))
+    return path
+
+
+def test_a_last_line_that_lacks_its_end_alone_counts(tmp_path):
+    path = _log(tmp_path / "r.log.jsonl")
+    path.write_bytes(path.read_bytes().rstrip(b"\n"))
+    read, lacking = read_log(path)
+    assert (read.commanded[:, 0].tolist(), lacking) == ([1.0, 2.0], "")
+
+
+@pytest.mark.parametrize("reserved", [b"\n\n", b"\0\0\n\0\0\n"])
+def test_lines_without_content_at_the_end_are_none(reserved, tmp_path):
+    path = _log(tmp_path / "r.log.jsonl")
+    path.write_bytes(path.read_bytes() + reserved)
+    read, lacking = read_log(path)
+    assert (read.samples, lacking) == (2, "")
+
+
+def test_the_command_of_an_averaged_sample_is_its_last_one(tmp_path):
+    """As in the recording: a rig that ramps a set point has it at the end."""
+    read, _ = read_log(_log(tmp_path / "r.log.jsonl", ((1.0,), (3.0,), (5.0,)), (0, 0, 1)))
+    np.testing.assert_array_equal(read.commanded[:, 0], [3.0, 5.0])
+    np.testing.assert_allclose(read.t_s, [0.0, 0.15])
+
+
 SAMPLE = '{head}\n{"row":0,"run":RUN,"t_s":0,"p":[1],"k":[[0,0,0]]}\n{}\n'
 
 

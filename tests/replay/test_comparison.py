@@ -5,7 +5,7 @@ import pytest
 
 from surgisoft.error_scale import bar_length, error_scale
 from surgisoft.errors import InputError
-from surgisoft.replay.comparison import MOST_ROWS, write_comparison
+from surgisoft.replay.comparison import MOST_ROWS, write_change, write_comparison
 from surgisoft.tasks.episodes.parts import Event
 from surgisoft.time_axis import continued, pauses, with_gaps
 from tests.replay.reading import column, entities
@@ -46,6 +46,23 @@ def test_errors_are_arrows_from_measured_to_predicted(tmp_path):
     bodies = column(replay.path, "/measured/body", "LineStrips3D:strips")
     assert sorted(set(range(50)) - set(bodies)) == [7, 9]
     np.testing.assert_allclose(np.array(bodies[0][0])[[0, -1]], measured[0][[0, -1]], atol=1e-4)
+
+
+def test_an_explained_change_is_drawn_to_the_scale_of_the_measured_one(tmp_path):
+    """Effects that explain two fifths of it: arrows of two fifths, from the same points."""
+    t_s, before, _ = made_up()
+    change = np.random.default_rng(2).normal(0.0, 0.5, before.shape)
+    replay = write_change(t_s, before, before + change, 0.4 * change, "x", tmp_path / "c.rrd")
+    arrows = {
+        name: column(replay.path, f"/change/{name}", "Arrows3D:vectors")
+        for name in ("measured", "explained")
+    }
+    stretch = np.array(arrows["measured"][3]) / change[3]
+    assert stretch.min() == pytest.approx(stretch.max(), rel=1e-3)
+    assert stretch.mean() > 1.0
+    for row in (3, 7):
+        whole, part = (np.array(arrows[name][row]) for name in ("measured", "explained"))
+        np.testing.assert_allclose(part, 0.4 * whole, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("apart_mm", [0.0, 0.5])

@@ -89,6 +89,49 @@ def test_foreign_text_is_escaped_and_nothing_is_referred_to():
     assert links == [a["id"] for tag, a in tags.seen if tag == "section"] != []
 
 
+FOREIGN = 'a<b>&"c'
+"""Text as a file name or a note may have it."""
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        Text(FOREIGN),
+        Text(f"`{FOREIGN}`"),
+        Command(FOREIGN),
+        Facts([(FOREIGN, "1")]),
+        Facts([("name", FOREIGN)]),
+        Table([FOREIGN], [["1"]]),
+        Table(["name"], [[FOREIGN]]),
+        Table(["name"], [["1"]], FOREIGN),
+        Picture(b"1", FOREIGN),
+        Picture(b"1", "alt", FOREIGN),
+        Section(FOREIGN, []),
+    ],
+)
+def test_every_text_of_every_part_is_escaped(part):
+    """No tag of its own, no end of an attribute; a browser shows it as it was given."""
+    text, tags = [], []
+    parser = HTMLParser(convert_charrefs=True)
+    parser.handle_data = text.append
+    parser.handle_starttag = lambda tag, values: tags.append((tag, dict(values)))
+    parser.feed(part.to_html())
+    parser.close()
+    alternative = [values["alt"] for _, values in tags if values.get("alt")]
+    assert FOREIGN in ["".join(text), *text, *alternative] or FOREIGN in "".join(text)
+    assert "b" not in [tag for tag, _ in tags]
+    assert all("c" not in values and 'c"' not in values for _, values in tags)
+
+
+@pytest.mark.parametrize(
+    ("value", "width", "said"), [(1.25, "100.0", "125 %"), (-0.1, "0.0", "-10 %")]
+)
+def test_the_bar_of_a_share_ends_at_none_and_all(value, width, said):
+    shown = Share(value).to_html()
+    assert f"width:{width}%" in shown
+    assert f">{said}<" in shown
+
+
 def test_verdict_comes_before_everything_else():
     text = render(example())
     assert text.index("96 % of the excess") < text.index("<dl") < text.index("<section")

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from surgisoft.errors import InputError
-from surgisoft.rig.drivers.bench_map import KeyPoints, load_bench_map, map_of
+from surgisoft.rig.drivers.bench_map import BenchMap, KeyPoints, load_bench_map, map_of
+from surgisoft.rig.drivers.bench_map import FrameMap as BenchFrame
 from surgisoft.rig.drivers.clock import ClockMap
 from surgisoft.rig.drivers.line_protocol import Data, Info, crc16, line, words_of
 from surgisoft.rig.drivers.motion_capture import (
@@ -78,6 +80,9 @@ def test_the_json_stream_is_read_and_written():
         np.testing.assert_array_equal(again.bodies[name].position_mm, body.position_mm)
     metres = decode_json(b'{"frame":1,"t":0,"unit":"m","points":{"a":[0.001,0,1]}}')
     np.testing.assert_allclose(metres.points["a"], [1.0, 0.0, 1000.0])
+    cm = decode_json(b'{"frame":1,"t":0,"unit":"cm","bodies":{"b":{"position":[1,-2.5,0]}}}')
+    np.testing.assert_allclose(cm.bodies["b"].position_mm, [10.0, -25.0, 0.0])
+    np.testing.assert_array_equal(cm.bodies["b"].rotation, STILL)
 
 
 @pytest.mark.parametrize(
@@ -210,6 +215,16 @@ def test_a_map_puts_markers_into_the_arms_base_frame(tmp_path):
     np.testing.assert_allclose(points[1], [0.0, 0.0, -5.0], atol=1e-9)
 
 
+def test_three_turns_of_a_frame_are_about_fixed_axes_one_after_another():
+    """Against SciPy's extrinsic Euler angles; a point on the base's y axis, 20 mm from it."""
+    degrees, origin = (30.0, -50.0, 110.0), (7.0, -8.0, 9.0)
+    turn = Rotation.from_euler("xyz", degrees, degrees=True)
+    bench = BenchMap(("tip",), frame=BenchFrame(origin_mm=origin, rotation_deg=degrees))
+    at = np.array(origin) + turn.apply([0.0, 20.0, 0.0])
+    found = KeyPoints(bench)(Frame(1, 0.0, {"tip": at}, {}))
+    np.testing.assert_allclose(found, [[0.0, 20.0, 0.0]], atol=1e-12)
+
+
 def test_without_the_body_of_the_frame_nothing_is_known(tmp_path):
     (tmp_path / "bench.toml").write_text(MAP)
     read = KeyPoints(load_bench_map(tmp_path / "bench.toml"))
@@ -280,6 +295,25 @@ def test_the_stream_is_documented_as_it_is_read():
     assert set(frame.points) == {"tip", "k3"}
     assert np.isnan(frame.points["k3"]).all()
     np.testing.assert_array_equal(frame.bodies["base"].position_mm, [1.0, 2.0, 3.0])
+
+
+def test_frames_that_come_late_or_twice_are_none_and_missing_ones_are_counted():
+    """Frame 8 is late; the sender counts from 0 again while its clock goes on."""
+    listening = listen("127.0.0.1", 0)
+    receiver = FrameReceiver(listening, decode_json, "x")
+    sent = [(7, 1.0), (9, 1.2), (9, 1.2), (8, 1.1), (0, 1.3), (1, 1.4)]
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            for number, t_s in sent:
+                packet = encode_json(Frame(number, t_s, {}, {}))
+                sender.sendto(packet, listening.getsockname())
+        first = receiver.next_from(1.0, 5.0)
+        receiver.put_back(first)
+        assert receiver.next_from(1.4, 5.0).number == 1
+        assert receiver.newest_s == 1.4
+    finally:
+        receiver.close()
+    assert (first.number, receiver.dropped, receiver.damaged) == (7, 1, 0)
 
 
 def test_a_datagram_of_brackets_is_a_damaged_one():

@@ -44,6 +44,18 @@ def test_actions_beyond_the_limits_are_clipped_and_reported():
         named.send({"c1_kPa": 1.0, "c2_kPa": 1.0})
 
 
+def test_a_rig_that_is_connected_again_knows_no_old_command():
+    """It was vented meanwhile: what is not finite leaves it vented."""
+    named = NamedRig("virtual:seed=3")
+    named.connect()
+    named.send({"c1_kPa": 20.0, "c2_kPa": 5.0, "c3_kPa": 9.0})
+    named.disconnect()
+    named.connect()
+    sent = named.send({"c1_kPa": float("nan"), "c2_kPa": 1.0, "c3_kPa": float("inf")})
+    named.disconnect()
+    assert sent == {"c1_kPa": 0.0, "c2_kPa": 1.0, "c3_kPa": 0.0}
+
+
 class Blinking:
     """A rig whose camera sees one point in every other sample."""
 

@@ -97,6 +97,17 @@ def test_it_moves_one_chamber_at_a_time_and_ends_vented(predict):
     assert rig.vents == 1
 
 
+@pytest.mark.parametrize(("noise_mm", "still"), [(0.79, 0), (0.81, 3)])
+def test_a_motion_that_noise_alone_may_make_is_none(noise_mm, still):
+    """4 mm as predicted; five standard errors are 3.95 mm, or 4.05 mm."""
+    at = np.zeros((4, 2, 3))
+    at[:, 1, 2] = 70.0
+    at[1:, 1] += 4.0 * np.array([[1, 0, 0], [-0.6, 0.8, 0], [-0.6, -0.8, 0]])
+    faults = judge(at, at, noise_mm).faults
+    assert len(faults) == still
+    assert all(f"chamber {i} moves the tip by 4.00 mm" in text for i, text in enumerate(faults, 1))
+
+
 def test_a_tip_that_is_not_seen_is_said():
     seen = np.ones((4, 5, 3))
     seen[:, -1] = np.nan

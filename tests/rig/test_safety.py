@@ -181,6 +181,45 @@ def test_a_lost_sight_that_comes_back_goes_on():
     assert bench.vents == 0
 
 
+def test_a_command_that_is_held_is_a_valid_one():
+    """0.9 s without sight, then 0.5 s without a finite command: neither lasts for a second."""
+    bench = Valves()
+    rig = SafeRig(bench, Safety(rate=1e4, hold_ms=200.0, vent_ms=1000.0))
+    drive(rig, [[5.0, 5.0]])
+    bench.points = np.full((1, 3), np.nan)
+    drive(rig, [[6.0, 6.0]] * 18)
+    bench.points = np.zeros((1, 3))
+    drive(rig, [[np.nan, 7.0]] * 10)
+    assert rig.counts["held"] >= 13
+    assert (bench.vents, bench.at.tolist()) == (0, [6.0, 6.0])
+
+
+def test_a_ramp_ends_with_a_reset():
+    bench = Valves()
+    rig = SafeRig(bench, Safety(rate=10.0))
+    drive(rig, [[40.0, 40.0]] * 3)
+    assert 0.0 < bench.at[0] < 40.0
+    rig.reset()
+    sent = len(bench.sent)
+    for _ in range(5):
+        rig.read()
+    rig.wait(1.0)
+    assert (bench.at.tolist(), len(bench.sent)) == ([0.0, 0.0], sent)
+
+
+def test_time_in_a_wait_is_no_time_without_sight_or_command():
+    """Nobody looks and nobody commands while a program waits, three times as long as it may."""
+    bench = Valves()
+    rig = SafeRig(bench, Safety(rate=1e4, hold_ms=200.0, vent_ms=1000.0))
+    drive(rig, [[5.0, 5.0]])
+    rig.wait(3.0)
+    rig.command([9.0, 8.0])
+    assert (rig.counts["held"], bench.at.tolist()) == (0, [9.0, 8.0])
+    rig.wait(3.0)
+    rig.command([np.nan, 8.0])
+    assert (rig.counts["refused"], bench.at.tolist(), bench.vents) == (1, [9.0, 8.0], 0)
+
+
 def test_a_program_that_hangs_is_vented_by_the_watchdog():
     bench = Valves()
 
@@ -271,6 +310,32 @@ def test_the_first_reason_of_a_stop_counts_and_nothing_is_commanded_after_it():
         with pytest.raises(RigStopped, match="first"):
             call()
     assert (bench.vents, bench.sent) == (1, [])
+
+
+def test_a_stop_between_a_command_and_its_sending_sends_nothing():
+    """As by another thread: the clock is read after the command was accepted."""
+    bench, stops = Valves(), []
+
+    def clock():
+        for stop in stops:
+            stop("emergency stop by a key")
+        return 0.0
+
+    rig = SafeRig(bench, Safety(rate=1e4), clock=clock)
+    stops.append(rig.stop)
+    with pytest.raises(RigStopped, match="by a key"):
+        rig.command([20.0, 30.0])
+    assert (bench.vents, bench.sent, bench.at.tolist()) == (1, [], [0.0, 0.0])
+
+
+def test_a_stop_in_a_dry_run_touches_no_valve():
+    bench, shown = Valves(), []
+    rig = SafeRig(bench, show=shown.append)
+    rig.command([1.0, 1.0])
+    rig.stop("enough")
+    with pytest.raises(RigStopped, match="enough"):
+        rig.command([2.0, 2.0])
+    assert (bench.vents, bench.sent, len(shown)) == (0, [], 1)
 
 
 def test_a_signal_does_not_break_off_the_venting():

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -214,6 +215,25 @@ def test_any_rig_can_be_driven():
     np.testing.assert_allclose(recording.t_s, [0, 2.5, 5.0])
     assert recording.unit == "deg"
     assert recording.noise_mm is None
+
+
+class Ramping(Bellows):
+    """Its controllers move the set point on from frame to frame: 0.1, 0.2, ... degrees."""
+
+    frames = 0
+
+    def read(self):
+        self.frames += 1
+        return replace(super().read(), commanded=np.full(2, 0.1 * self.frames))
+
+
+def test_the_command_of_a_steady_state_is_that_of_its_last_frame():
+    plan = Protocol("steps", "settled", [[10.0, 20], [30, 40]], [0, 0], average_s=0.5, unit="deg")
+    bench = Ramping()
+    recording = collect(bench, plan)
+    half = bench.frames // 2
+    assert half > 1
+    np.testing.assert_allclose(recording.commanded[:, 0], [0.1 * half, 0.2 * half])
 
 
 @pytest.mark.parametrize(

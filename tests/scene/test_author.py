@@ -21,6 +21,7 @@ from surgisoft.scene.author import (
     rounded_mount,
     write_scene,
 )
+from surgisoft.scene.camera import view
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.check import (
     REASONS,
@@ -213,6 +214,37 @@ def test_a_lesion_out_of_reach_is_told_why(made, tmp_path):
         "out of reach",
         "beam blocked",
     }
+
+
+def finding(verdict, what):
+    return next(each for each in verdict.findings if each.what == what)
+
+
+def test_a_camera_that_is_too_near_is_told(made, tmp_path):
+    """Sharp from 150 mm on, farther than the endoscope's arm stands from its lesion."""
+    camera = dataclasses.replace(open_scene(made[1]).spec.camera, range_mm=(150.0, 200.0))
+    scene = open_scene(scene_with(made, tmp_path, camera=camera))
+    found = finding(check_scene(scene, reaches_of(scene)), "camera to lesion")
+    assert float(found.value.split()[0]) < 150.0
+    assert (found.wanted, found.good) == ("150 to 200 mm", False)
+
+
+def test_the_worst_moment_of_the_view_counts(made, monkeypatch):
+    """The lasers hide the whole ring once, and never again."""
+    times = []
+
+    def hidden_once(caster, camera, pose, points, normals, arms=None):
+        seen = view(caster, camera, pose, points, normals, arms)
+        if arms is not None:
+            times.append(seen)
+        return dataclasses.replace(seen, visible=seen.visible & (len(times) != 2))
+
+    monkeypatch.setattr("surgisoft.scene.check.view", hidden_once)
+    scene = open_scene(made[1])
+    verdict = check_scene(scene, reaches_of(scene))
+    assert len(times) > 2
+    found = finding(verdict, "ring in view")
+    assert (found.value, found.good) == ("0 %", False)
 
 
 def test_a_lesion_off_the_organ_is_a_verdict(made, tmp_path, capsys):
@@ -440,6 +472,32 @@ def test_gltf_comes_in_metres_with_y_up(tmp_path):
     size = np.ptp(prepared.meshes[0].bounds_mm, axis=0)
     np.testing.assert_allclose(size, [100.0, 60.0, 40.0], rtol=1e-6)
     assert any("y points up" in note for note in prepared.notes)
+
+
+def test_a_second_file_has_a_unit_and_an_up_of_its_own(tmp_path):
+    """An organ in mm with z up, and a vessel from a glTF file, in metres with y up."""
+    write_ply(ball(60.0, 3), tmp_path / "organ.ply")
+    shape = trimesh.creation.box((0.1, 0.04, 0.06))
+    shape.apply_translation((0.0, 0.2, 0.0))
+    shape.export(tmp_path / "vessel.glb")
+    files = tmp_path / "organ.ply", tmp_path / "vessel.glb"
+    organ, vessel = prepare(Request(files, ("organ", "keep-out"))).meshes
+    np.testing.assert_allclose(np.ptp(organ.bounds_mm, axis=0), 120.0, rtol=0.01)
+    np.testing.assert_allclose(vessel.bounds_mm, [[-50, -30, 180], [50, 30, 220]], atol=1e-3)
+
+
+def test_the_organ_is_the_largest_body_of_its_file(tmp_path):
+    """A node of 20 mm comes before the organ of 80 mm."""
+    scene = trimesh.Scene()
+    for name, size, x in (("a", 0.02, 0.09), ("b", 0.08, 0.0)):
+        shape = trimesh.creation.box((size,) * 3)
+        shape.apply_translation((x, 0.0, 0.0))
+        scene.add_geometry(shape, node_name=name, geom_name=name)
+    scene.export(tmp_path / "two.glb")
+    prepared = prepare(Request((tmp_path / "two.glb",), ("organ",)))
+    assert prepared.roles == ("organ", "keep-out")
+    sizes = [np.ptp(mesh.bounds_mm, axis=0)[0] for mesh in prepared.meshes]
+    assert sizes == pytest.approx([80.0, 20.0])
 
 
 def test_mounts_are_found_for_an_arm_of_another_length(tmp_path, monkeypatch, capsys):

@@ -58,7 +58,20 @@ def test_a_margin_grows_a_square_by_hand(plane):
     assert path.length_mm == pytest.approx(40.0 + 4.0 * math.pi, rel=2e-3)
     off = signed_distance_mm(path.points_mm[:, :2], np.array(square)[:, :2])
     np.testing.assert_allclose(off, 2.0, atol=0.01)
-    assert len(grown(plane, np.array(square)[::-1], 2.0)) > 100, "either direction of travel"
+    back = grown(plane, np.array(square)[::-1], 2.0)
+    assert len(back) > 100, "either direction of travel"
+    np.testing.assert_allclose(back[:, 2], 5.0, atol=1e-6, err_msg="on the same side of the box")
+
+
+def test_a_margin_that_closes_a_gap_leaves_the_outer_line(plane):
+    """A wall of 5 mm around a yard of 10 mm with a gate of 1 mm, grown by 1 mm."""
+    corners = [(-10, -10), (10, -10), (10, 10), (0.5, 10), (0.5, 5), (5, 5), (5, -5), (-5, -5)]
+    corners += [(-5, 5), (-0.5, 5), (-0.5, 10), (-10, 10)]
+    for turned in ((x, y) for x in (1.0, -1.0) for y in (1.0, -1.0)):
+        outline = np.array([(turned[0] * x, turned[1] * y, 5.0) for x, y in corners])
+        line = grown(plane, outline, 1.0)
+        length = np.linalg.norm(np.roll(line, -1, axis=0) - line, axis=1).sum()
+        assert length == pytest.approx(80.0 + 2.0 * math.pi, rel=5e-3)
 
 
 def test_a_raster_covers_a_disc_by_hand(plane):

@@ -60,6 +60,21 @@ def test_named_parts_come_apart_in_their_places(name, tmp_path):
     assert sorted(len(part.faces) for part in parts) == [12, 80]
 
 
+def test_a_part_that_its_file_mirrors_is_wound_outwards_still(tmp_path):
+    """A box 2 wide whose node mirrors x and moves it by 5: from 3 to 5 of 5 - x."""
+    box = trimesh.creation.box((2.0, 4.0, 6.0))
+    box.apply_translation((1.0, 0.0, 0.0))
+    mirrored = np.diag([-1.0, 1.0, 1.0, 1.0])
+    mirrored[0, 3] = 5.0
+    scene = trimesh.Scene()
+    scene.add_geometry(box, node_name="mirrored", transform=mirrored)
+    scene.export(tmp_path / "a.glb")
+    (part,) = read_parts(tmp_path / "a.glb")
+    mesh = Mesh(part.vertices, part.faces)
+    assert mesh.volume_mm3 == pytest.approx(48.0, rel=1e-5)
+    np.testing.assert_allclose(mesh.bounds_mm, [[3, -2, -3], [5, 2, 3]], atol=1e-5)
+
+
 def test_ply_keeps_every_bit(tmp_path):
     rng = np.random.default_rng(1)
     mesh = lumpy(3)

@@ -13,7 +13,7 @@ from surgisoft.scene.author import Request, choose_sites, prepare, ring_diameter
 from surgisoft.scene.folder import open_scene
 from surgisoft.scene.inside import winding_numbers
 from surgisoft.scene.mesh import Mesh
-from surgisoft.scene.segmentation import parse_label, read_segmentation
+from surgisoft.scene.segmentation import parse_label, read_image, read_segmentation
 
 nibabel = pytest.importorskip("nibabel", reason="the extra 'segmentation' is not installed")
 nrrd = pytest.importorskip("nrrd", reason="the extra 'segmentation' is not installed")
@@ -138,6 +138,51 @@ def test_the_headers_unit_counts(read, tmp_path):
     np.testing.assert_allclose(
         again.parts[0].vertices.max(0), read.parts[0].vertices.max(0), atol=0.02
     )
+
+
+def test_a_vessel_beside_the_organ_does_not_fill_its_notch(tmp_path):
+    """An L of 1 mm voxels with a block in its notch, which touches the walls of the L."""
+    labels = np.zeros((40, 40, 20), np.uint8)
+    labels[4:36, 4:36, 4:16] = 1
+    labels[20:36, 20:36] = 0
+    labels[20:32, 20:32, 4:16] = 2
+    path = write_nifti(tmp_path / "ct.nii", labels, np.eye(4))
+    found = read_segmentation(path, tuple(map(parse_label, ("1:organ:liver", "2:keep-out:vein"))))
+    organ = Mesh(found.parts[0].vertices, found.parts[0].faces)
+    assert organ.volume_mm3 == pytest.approx((labels == 1).sum(), rel=0.02)
+    inside = winding_numbers(organ, np.array([[12.0, 12.0, 10.0], [26.0, 26.0, 10.0]]))
+    np.testing.assert_allclose(inside, [1.0, 0.0], atol=1e-6)
+
+
+@pytest.mark.parametrize(("unit", "mm"), [("mm", 1.0), ("cm", 10.0), ("m", 1000.0)])
+@pytest.mark.parametrize(
+    ("space", "to_right_anterior"),
+    [
+        ("left-posterior-superior", (-1.0, -1.0)),
+        ("LPS", (-1.0, -1.0)),
+        ("left-anterior-superior", (-1.0, 1.0)),
+        ("LAS", (-1.0, 1.0)),
+        ("right-anterior-superior", (1.0, 1.0)),
+        ("RAS", (1.0, 1.0)),
+    ],
+)
+def test_every_frame_and_unit_of_a_nrrd_becomes_mm_right_anterior_superior(
+    space, to_right_anterior, unit, mm, tmp_path
+):
+    """The middle of the voxel (2, 0, 1), written by hand in the file's frame and unit."""
+    header = {
+        "space": space,
+        "space directions": [[1.5, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.25, 3.0]],
+        "space origin": [10.0, -20.0, 30.0],
+        "space units": [unit] * 3,
+    }
+    path = tmp_path / "ct.nrrd"
+    nrrd.write(str(path), np.ones((3, 3, 3), np.uint8), header)
+    image = read_image(path)
+    right, anterior, superior, _ = image.to_ras @ [2.0, 0.0, 1.0, 1.0]
+    expected = (to_right_anterior[0] * 13.0 * mm, to_right_anterior[1] * -19.75 * mm, 33.0 * mm)
+    assert (right, anterior, superior) == pytest.approx(expected)
+    assert image.oriented
 
 
 def test_slicers_segments_have_names_and_may_overlap(tmp_path):

@@ -16,7 +16,14 @@ from surgisoft.surrogate.history import pack
 from surgisoft.surrogate.interval import coverage_of
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import HawEnsemble, HawNN, range_weights, weighted_mse
-from surgisoft.surrogate.training import Data, model_rows, normalise
+from surgisoft.surrogate.training import (
+    Data,
+    make_rows,
+    model_rows,
+    normalise,
+    rest_shape,
+    validated_error,
+)
 from surgisoft.surrogate.training import train as train_model
 from tests.surrogate.truth import SPEC, history, shape, traverse, walk
 
@@ -100,6 +107,40 @@ def test_excitation_distinguishes_a_random_walk_from_a_traverse():
     assert not fast.minor_loops
     # 12 * 12 sweeps of the fast chamber, one reversal between two, one at the start from rest.
     assert fast.reversals == 144
+
+
+def test_the_shape_at_rest_is_the_mean_of_the_rows_nearest_to_no_actuation():
+    """Fifty rows from -9 kPa up in steps of 1 kPa, the point at x = p mm, missing at 0 and 3 kPa:
+    the twenty nearest of the others are those from -9 to 12 kPa."""
+    p = torch.arange(-9.0, 41.0)
+    points = torch.stack([p, 0 * p, 70 + 0 * p], 1)[:, None]
+    points[[9, 12]] = torch.nan
+    some = pack([torch.arange(50.0)], [p[:, None]], [points])
+    nearest = [x for x in range(-9, 13) if x not in (0, 3)]
+    assert len(nearest) == 20
+    expected = [[sum(nearest) / 20.0, 0.0, 70.0]]
+    np.testing.assert_allclose(rest_shape(some).numpy(), expected, rtol=1e-6)
+
+
+def test_a_block_of_rows_ends_with_its_run():
+    """Runs of 60 and 30 rows: blocks of 25, 25 and 10 rows, then of 25 and 5."""
+    runs = history([walk(60, np.random.default_rng(1)), walk(30, np.random.default_rng(2))])
+    low, high = torch.tensor(SPEC.low), torch.tensor(SPEC.high)
+    model = ArmModel(SPEC, HawNN(low, high, SPEC.key_points, (4,), directions=False))
+    block = make_rows(model, runs).block
+    assert block.bincount().tolist() == [25, 25, 10, 25, 5]
+    assert (block.diff() >= 0).all()
+
+
+def test_the_validated_error_counts_every_measured_key_point_once():
+    """Distances of 1, 1, 1 mm of one key point and of 3 mm of one that was seen once."""
+    target = torch.zeros(3, 2, 3)
+    predicted = torch.zeros(3, 2, 3)
+    predicted[:, 0, 0], predicted[:, 1, 1] = 1.0, 3.0
+    target[1:, 1] = torch.nan
+    found = validated_error(target, predicted)
+    assert found.rmse_mm == pytest.approx(np.sqrt((1 + 1 + 1 + 9) / 4))
+    assert found.per_key_point_mm == pytest.approx([1.0, 3.0])
 
 
 def test_same_seed_same_weights():

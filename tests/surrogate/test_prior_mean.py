@@ -75,6 +75,19 @@ def test_bends_recorded_one_by_one_give_the_arm_of_both():
     assert float(error.norm(dim=-1).max()) < 0.6, "of a motion of 100 mm: the ridge's bias"
 
 
+def test_a_long_recording_is_thinned_from_its_begin_to_its_end():
+    """3200 rows: chamber 1 moves in the first half, chamber 2 in the second one."""
+    steps = 25.0 * (1.0 - np.cos(np.arange(1600) / 40.0))
+    pressure = np.zeros((3200, 2))
+    pressure[:1600, 0], pressure[1600:, 1] = steps, steps
+    prior = ArcChain(LOW, HIGH, 3, 2)
+    rest = torch.tensor(arm(np.zeros((1, 2)))[0])
+    fit_prior_mean(prior, recorded(pressure), rest.float())
+    with torch.no_grad():
+        left = prior(torch.tensor(pressure[1600:]).float()).numpy() - arm(pressure[1600:])
+    assert np.linalg.norm(left, axis=-1).max() < 3.0, "of a motion of 80 mm"
+
+
 def test_a_chamber_that_hardly_moved_gets_no_bend_of_its_own():
     """Chamber 2 moves by a hundredth of its range, along with noise of the markers."""
     rng = np.random.default_rng(1)

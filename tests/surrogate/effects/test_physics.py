@@ -339,6 +339,20 @@ def test_payload_bends_a_quarter_circle_by_castiglianos_theorem():
     assert float(across) == pytest.approx(unit * 0.5, rel=0.01)
 
 
+def test_an_arm_that_stands_on_a_support_is_not_thrown_aside():
+    """Straight, or bent by half a millimetre, under a ceiling 10 mm below its tip: the beam hardly
+    yields along the normal, and the tip moves by at most 10 mm / 0.2, as if at that slope."""
+    facts = arm(STRAIGHT)
+    ceiling = make_effect("contact", facts, point=8, rise_rad=math.pi / 2, offset_mm=70.0)
+    bent = STRAIGHT.clone()
+    bent[:, 0] = 0.5 * (STRAIGHT[:, 2] / 80.0) ** 2
+    for points in (STRAIGHT, bent):
+        moved = pose(with_strength(ceiling, share=1.0), points) - points
+        assert moved.isfinite().all()
+        assert moved.norm(dim=-1).max() <= 10.0 / 0.2 + 1e-3
+    assert moved[8, 0] > 40.0
+
+
 def test_contact_holds_the_point_at_a_rigid_support_and_bends_the_rest():
     facts = arm(STRAIGHT)
     tilted = STRAIGHT + 0.1 * torch.outer(STRAIGHT[:, 2], torch.tensor([1.0, 0.0, 0.0]))

@@ -186,7 +186,9 @@ def rules(results: Results) -> str:
     """Definition of success in one sentence: the rule of the task, and no abort."""
     spec = results.experiment
     rule = spec.of.success_rule
-    return f"Success: {f'{rule(spec.task)}; ' if rule else ''}nothing is aborted."
+    varied = [vary.field.removeprefix("task.") for vary in spec.vary if vary.field[:5] == "task."]
+    of_setting = f" ({', '.join(varied)}: the setting's value)" if rule and varied else ""
+    return f"Success: {f'{rule(spec.task)}{of_setting}; ' if rule else ''}nothing is aborted."
 
 
 def _outcomes(results: Results) -> Section:

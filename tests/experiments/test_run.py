@@ -8,6 +8,7 @@ import shutil
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -20,6 +21,7 @@ from surgisoft.cli import run
 from surgisoft.errors import InputError
 from surgisoft.experiments import run as experiment_run
 from surgisoft.experiments import spec as experiment_spec
+from surgisoft.experiments.page import rules
 from surgisoft.experiments.plan import build_task, settings
 from surgisoft.experiments.results import sum_up
 from surgisoft.experiments.run import open_results, run_experiment
@@ -304,3 +306,12 @@ def test_a_fault_that_never_came_is_said_to_have_not(tmp_path, capsys):
     file.write_text(file.read_text().replace("on_timeout", 'until = "succeeded"\non_timeout'))
     assert run(["experiment", "check", str(file)]) == 2
     assert "got 'succeeded'; expected one of at rest, never" in capsys.readouterr().err
+
+
+def test_the_rule_of_success_says_which_of_its_values_vary(tmp_path):
+    """The sentence has the value of the file, and each setting one of its own."""
+    plain = load_experiment(write(tmp_path, TINY))
+    assert "setting's value" not in rules(SimpleNamespace(experiment=plain))
+    vary = '\n[[vary]]\nfield = "task.fire_mm"\nvalues = [0.5, 5.0]\n'
+    varied = load_experiment(write(tmp_path, TINY + vary))
+    assert "(fire_mm: the setting's value); " in rules(SimpleNamespace(experiment=varied))

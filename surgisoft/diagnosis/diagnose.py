@@ -635,6 +635,10 @@ def with_refit(result: Diagnosis, joint: Refit, problem: Problem) -> Diagnosis:
                 verdict = Verdict(none.kind, (), sentence, round(quiet, 4), none.reason)
                 ranking = tuple(replace(row, confidence=0.0, in_words="") for row in ranking)
                 command, competing, plan = next_command(none), (), None
+    was = result.verdict
+    if chances is not None and verdict.effects != was.effects:
+        stale = second_too(Decision(was.kind, was.effects, was.confidence, chances))
+        checks = tuple(each for each in checks if each not in stale)
     return replace(
         result,
         verdict=verdict,

@@ -16,7 +16,15 @@ from surgisoft.diagnosis import diagnose as diagnosing
 from surgisoft.diagnosis import improve as improving
 from surgisoft.diagnosis import refit as refitting
 from surgisoft.diagnosis.candidates import with_effect
-from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Ranked, Verdict, with_refit
+from surgisoft.diagnosis.decision import Decision
+from surgisoft.diagnosis.diagnose import (
+    Diagnosis,
+    ErrorLevels,
+    Ranked,
+    Verdict,
+    second_too,
+    with_refit,
+)
 from surgisoft.diagnosis.estimation.intervals import Parameter
 from surgisoft.diagnosis.inputs import identification_problem
 from surgisoft.diagnosis.refit import (
@@ -395,10 +403,16 @@ def test_without_a_winner_an_effect_that_was_tried_is_not_named_any_more(problem
     assert with_refit(load, none, problem).verdict == load.verdict
 
 
-def test_the_refit_decides_over_the_residuals(problem, found):
-    result = with_refit(named("creep", found), found, problem)
+def test_the_refit_decides_over_the_residuals(problem, found, unasked):
+    chances = replace(unasked.probabilities, pair=0.4, two=("creep", "payload"))
+    residuals = replace(named("creep", found), probabilities=chances)
+    beside = second_too(Decision("identified", ("creep",), 0.0, chances))
+    assert beside, "a payload may be missing beside the creep"
+    residuals = replace(residuals, checks=("of the data", *beside))
+    result = with_refit(residuals, found, problem)
     assert result.verdict.effects[0] == "line_lag"
     assert result.verdict.kind == "identified"
+    assert result.checks == ("of the data",), "beside a creep that is not named any more"
     assert found.sentence in result.verdict.sentence
     assert result.ranking[0].effect == "line_lag"
     assert result.ranking[0].confidence == pytest.approx(found.confidence, abs=1e-4)

@@ -29,8 +29,9 @@ from surgisoft.diagnosis.pairs import (
     matches,
     paired_discrepancy,
     rms_by_point,
+    slope_error,
 )
-from surgisoft.diagnosis.residuals import LEAST_DISCREPANCY, residual_table
+from surgisoft.diagnosis.residuals import LEAST_DISCREPANCY, model_discrepancy, residual_table
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import make_protocol
@@ -167,6 +168,63 @@ def test_rows_are_paired_where_the_actuation_agrees_now_and_over_the_past():
     assert left_out[1] == pytest.approx(818, abs=3)
     assert left_out[-1] == pytest.approx(851, abs=3)
     assert len(left_out) == pytest.approx(35, abs=5)
+
+
+@pytest.mark.parametrize("differs", ["measured", "commanded"])
+def test_rows_are_paired_by_the_commands_or_by_what_was_measured(model, differs):
+    """Sensors that read a fifth more, or commands of another motion, do not part recordings."""
+    motion = smooth_walk(3)
+    after, before = (
+        replace(each, commanded=each.measured.copy())
+        for each in (made(motion, 1.0), made(motion, 0.0, seed=2))
+    )
+    other = {"measured": 1.2 * after.measured, "commanded": smooth_walk(7)(after.t_s)}
+    after = replace(after, **{differs: other[differs]})
+    assert paired(model, after, before).pairs.paired.mean() > 0.9
+
+
+def test_the_share_that_is_paired_is_that_of_the_training_rows(model):
+    """BEFORE ends where the held-out rows of AFTER begin."""
+    motion = smooth_walk(3)
+    change = paired(model, made(motion, 0.0), made(motion, 0.0, rows=3 * ROWS // 4, seed=2)).change
+    assert change.paired_share > 0.97
+
+
+def test_the_error_of_slopes_by_hand(model):
+    """For three chambers 2.055 times the error over the motion; all of it where nothing moves."""
+    arm, rig = default_arm(), VirtualRig(0)
+    table = residual_table(arm, [rig.record(make_protocol("mixed", rig.limits, 600, seed=1))[0]])
+    motion = table.predicted_mm - table.predicted_mm.mean(axis=0)
+    error, moved = (
+        np.sqrt(np.mean(each))
+        for each in (model_discrepancy(arm, table.noise_mm) ** 2, np.square(motion).sum(2))
+    )
+    assert slope_error(table) == pytest.approx(2.0554 * error / moved, rel=1e-3)
+    assert slope_error(table) < 0.5
+    still = residual_table(model, [made(smooth_walk(3), 0.0, rows=600)])
+    assert slope_error(still) == 1.0
+
+
+def test_a_noise_that_is_stated_too_large_does_not_make_repeats_perfect(model):
+    """Repeats that differ by a tenth of the stated noise: half of it is what is taken."""
+    once = smooth_walk(3)(PERIOD_S * np.arange(ROWS // 2))
+    twice = np.concatenate([once, once])
+    before = replace(recording(unlearned(twice), twice, seed=2), noise_mm=10.0 * NOISE_MM)
+    pairs = paired(model, made(smooth_walk(3), 0.0, rows=ROWS // 2), before).pairs
+    assert pairs.source == "repeats"
+    np.testing.assert_allclose(pairs.repeatability_mm, 0.5 * pairs.earlier.noise_mm)
+
+
+def test_what_was_wrong_before_is_not_extrapolated(model):
+    """BEFORE covers the lower half of the range, where the error is up to so large."""
+    half = made(lambda t_s: 0.5 * smooth_walk(3)(t_s), 0.0)
+    whole = made(smooth_walk(8), 0.0, seed=2)
+    before = residual_table(model, [half])
+    found = known_error(residual_table(model, [whole]), before)
+    assert found.ratio < 0.5
+    left, error = (np.sqrt(np.mean(x**2)) for x in (found.reference.residual, before.residual_mm))
+    assert found.ratio == pytest.approx(left / error, rel=0.05), "of what fits without the row left"
+    assert np.abs(found.correction_mm).max() < 1.08 * np.abs(before.residual_mm).max()
 
 
 def test_a_row_has_one_partner_in_a_run():

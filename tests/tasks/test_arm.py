@@ -87,6 +87,9 @@ def test_an_observer_knows_of_the_feed():
     feed = Feed(way_mm=20.0, speed_mm_s=10.0, wait_s=0.3)
     world = World({"arm": Mounted(default_arm(), torch.eye(4))}, config, feed=feed)
     state = world.start(streams(1, 2))
+    part = state.arms["arm"]
+    assert part.points_mm[:, 0, 2].tolist() == pytest.approx([-20.0] * 2, abs=0.5)
+    assert torch.equal(part.seen_mm, part.points_mm)
     for _ in range(25):
         state = world.step(state, {"arm": torch.full((2, 3), 0.5)})
         part = state.arms["arm"]
@@ -124,3 +127,22 @@ def test_a_state_of_a_lone_arm_stays_as_it_was():
     for name, value in before.items():
         assert torch.equal(getattr(kept, name), value), name
         assert not torch.equal(getattr(lone.part, name), value), name
+
+
+def test_two_arms_of_a_world_draw_numbers_of_their_own():
+    vary = Randomisation(gain=0.1, noise_mm=0.2)
+    mounted = Mounted(default_arm(), torch.eye(4))
+    world = World({"a": mounted, "b": mounted}, WorldConfig(randomisation=vary))
+    state = world.start(streams(0, 500))
+    gains = torch.stack([part.gain.flatten() for part in state.arms.values()])
+    assert torch.corrcoef(gains)[0, 1].abs() < 0.1
+    state = world.step(state, {name: torch.zeros(500, 3) for name in "ab"})
+    noise = torch.stack([(p.seen_mm - p.points_mm).flatten() for p in state.arms.values()])
+    assert torch.corrcoef(noise)[0, 1].abs() < 0.1
+
+
+def test_an_environment_that_failed_stays_failed():
+    world, state = started(2)
+    state = replace(state, failed=torch.tensor([True, False]))
+    state = world.step(state, {"arm": torch.zeros(2, 3)})
+    assert state.failed.tolist() == [True, False]

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from surgisoft.errors import InputError
 from surgisoft.surrogate.checkpoint import default_arm
 from surgisoft.tasks.world.arm import Pneumatics, Randomisation
 from surgisoft.tasks.world.observer import AlphaBetaFilter
@@ -146,3 +147,9 @@ def test_an_environment_that_failed_stays_failed():
     state = replace(state, failed=torch.tensor([True, False]))
     state = world.step(state, {"arm": torch.zeros(2, 3)})
     assert state.failed.tolist() == [True, False]
+
+
+def test_an_arm_that_an_agent_drives_needs_an_action():
+    world, state = started(1)
+    with pytest.raises(InputError, match="no action for 'arm'"):
+        world.step(state, {})

@@ -121,7 +121,7 @@ def test_other_programs_get_the_same_actions(policy, exported):
         np.testing.assert_allclose(answer, done[rows], atol=1e-5)
         np.testing.assert_allclose(script(seen[rows]).numpy(), done[rows], atol=1e-5)
     about = json.loads((exported / "policy.json").read_text())
-    assert about["task"] == "track_circle"
+    assert (about["task"], about["checkpoint"]) == ("track_circle", "best")
     assert about["agents"]["arm"]["observation"] == seen.shape[1]
     with pytest.raises(InputError, match="already exists"):
         export(policy, exported)

@@ -6,11 +6,13 @@ import shutil
 import signal
 import threading
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 from rsl_rl.algorithms import PPO
 
+from surgisoft.agents import selection
 from surgisoft.agents.compiled_network import CompiledNetwork
 from surgisoft.agents.distributed import Processes
 from surgisoft.agents.learned import LearnedPolicy
@@ -23,11 +25,12 @@ from surgisoft.agents.ppo import (
     update,
 )
 from surgisoft.agents.presets import PRESETS, Plan, Preset, config_for, envs_for, preset_for
+from surgisoft.agents.rollout import Rollout
 from surgisoft.agents.run_folder import BEST, LAST, RunFolder
 from surgisoft.agents.selection import SEED, evaluate_checkpoint, is_better
 from surgisoft.agents.session import EvaluationRequest
 from surgisoft.agents.shared_ppo import SharedPPO
-from surgisoft.agents.training import Training, resume, train_new
+from surgisoft.agents.training import Clock, Training, resume, train_new
 from surgisoft.agents.training_request import TrainingRequest
 from surgisoft.agents.vec_env import STATE, JointEnv
 from surgisoft.errors import InputError
@@ -94,7 +97,7 @@ def test_resumed_is_uninterrupted(run, tmp_path):
 
     result = train_new(half, plan_of(), Processes(), CPU, stop_after_two)
     assert not result.done
-    assert RunFolder(half).load(LAST)["iteration"] < 4
+    assert RunFolder(half).load(LAST)["iteration"] == 3, "the turn in which it was asked to stop"
     torch.manual_seed(99)
     assert resume(half, Processes(), CPU).done
     assert_equal(weights(run), weights(RunFolder(half)))
@@ -472,6 +475,68 @@ def test_the_better_checkpoint_is_kept():
     assert is_better({"success": 0.5, "error_mm": 0.09}, one)
     assert not is_better(one, one)
     assert not is_better({"success": 0.5, "error_mm": float("nan")}, one)
+
+
+def test_an_evaluation_is_means_over_episodes_of_the_right_steps(monkeypatch):
+    """Two episodes of three and two steps: an error counts in every step, success at the end."""
+    nan = float("nan")
+    table = {
+        "beam_error_mm": [[3.0, 4.0, nan], [nan, 1.0, nan]],
+        "tissue_error_mm": [[5.0, 7.0, nan], [nan, 9.0, nan]],
+        "success": [[1.0, 0.0, 1.0], [1.0, 0.0, nan]],
+        "completion": [[0.2, 0.5, 0.7], [0.1, 0.3, nan]],
+        "clearance_mm": [[1.0, 2.0, 3.0], [5.0, 5.0, nan]],
+    }
+    over = torch.tensor([False, True])
+    measures = {name: torch.tensor(value) for name, value in table.items()}
+    played = Rollout("x", 0.1, torch.tensor([3, 2]), {}, over, ~over, measures)
+    monkeypatch.setattr(selection, "rollout", lambda *given, watch: played)
+    recorders = SimpleNamespace(log=lambda episode: episode)
+    monkeypatch.setattr(selection, "EpisodeRecorders", lambda *given, only: recorders)
+    found, first = evaluate_checkpoint(make_task("track_circle"), Random(), 2)
+    assert first == 0
+    assert found == pytest.approx(
+        {
+            "error_mm": 8.0 / 3.0,
+            "tissue_error_mm": 7.0,
+            "success": 0.5,
+            "completion": 0.5,
+            "clearance_mm": 3.2,
+        }
+    )
+
+
+def test_a_training_that_goes_on_knows_its_time_its_best_and_its_rate():
+    """A minute of two: half of it is done, and what was best stays the measure."""
+    plan = replace(plan_of(), steps=None, minutes=2.0)
+    task = make_task(plan.task, plan.task_config)
+    one, other = (Training(plan, task, Processes()) for _ in range(2))
+    one.best, one.clock = {"error_mm": 0.25, "success": 1.0}, Clock(60.0, 30.0)
+    one.agents["arm"].learning_rate = 1e-4
+    other.load_state(one.state())
+    assert other.agents["arm"].learning_rate == 1e-4
+    assert other.best == one.best
+    assert (other.clock.wall_s, other.clock.cpu_s, other.share) == (60.0, 30.0, 0.5)
+
+
+def test_each_process_has_episodes_and_noise_of_its_own(monkeypatch):
+    """One policy for all: the leader's weights are sent, before anything is drawn."""
+    sent = []
+    monkeypatch.setattr(torch.distributed, "broadcast", lambda tensor, src: sent.append(src))
+    plan, found = plan_of(), []
+    for rank in (0, 1):
+        training = Training(plan, make_task(plan.task, plan.task_config), Processes(rank, 2))
+        training.iteration = 3
+        assert training.steps == 2 * 3 * TINY.envs * TINY.rollout
+        found.append((training.env.state.world, torch.rand(4)))
+        (ppo,) = training.agents.values()
+        weights = [*ppo.actor.state_dict(), *ppo.critic.state_dict()]
+        assert sent == [0] * len(weights)
+        sent.clear()
+    (one, noise), (other, other_noise) = found
+    assert not set(one.stream.key.tolist()) & set(other.stream.key.tolist())
+    assert not torch.equal(one.steps, other.steps)
+    assert not torch.equal(noise, other_noise)
 
 
 def test_the_seed_that_selects_judges_nothing():

@@ -1,6 +1,8 @@
 """rsl-rl's own runner and ours see the same episodes, stored as they were."""
 
 import copy
+import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,12 +11,15 @@ from rsl_rl.runners import OnPolicyRunner
 from surgisoft.agents.distributed import Processes
 from surgisoft.agents.ppo import algorithm_config, collect_rollout, make_ppo
 from surgisoft.agents.presets import Preset
-from surgisoft.agents.vec_env import STATE, JointEnv, OneAgentEnv
+from surgisoft.agents.vec_env import STATE, JointEnv, OneAgentEnv, privileged_state
 from surgisoft.errors import InputError
+from surgisoft.surrogate.checkpoint import default_arm
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.path_following import FollowConfig
 from surgisoft.tasks.registry import make_task
 from surgisoft.tasks.track import TrackConfig
+from surgisoft.tasks.world.random_streams import streams
+from surgisoft.tasks.world.world import Mounted, World
 
 SHORT = TrackConfig(FollowConfig(loop_s=1.0, approach_s=0.5))
 
@@ -59,6 +64,30 @@ def test_first_episodes_do_not_end_together(task):
     steps = JointEnv(task, 8, seed=0, action_kPa=1.0).state.world.steps
     assert len(steps.unique()) == 8
     assert steps.max() < task.steps
+
+
+def test_the_privileged_state_by_hand():
+    """An arm that is driven in degrees, off its nominal base, whose cameras are off, too."""
+    model = default_arm()
+    model = model.replace(spec=replace(model.spec, unit="deg"))
+    pose = torch.eye(4)
+    pose[:3, 3] = torch.tensor([10.0, 20.0, 30.0])
+    arm = World({"arm": Mounted(model, pose)}).arms["arm"]
+    _, part = arm.start(streams(0, 1))
+    assert arm.per_kPa != 1.0
+    mount, angle = pose.clone(), 0.01
+    mount[:3, 3] += torch.tensor([1.0, 2.0, 3.0])
+    mount[:2, :2] = torch.tensor(
+        [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+    )
+    gain = arm.per_kPa * torch.tensor([[1.1, 1.0, 0.8]])
+    part = replace(part, seen_mm=part.points_mm - 2.0, gain=gain, mount=mount[None])
+    less, sine = 100.0 * (math.cos(angle) - 1.0), 100.0 * math.sin(angle)
+    expected = [2.0] * (3 * arm.key_points) + [1.0, 0.0, -2.0] + [1.0, 2.0, 3.0]
+    expected += [less, -sine, 0.0, sine, less, 0.0, 0.0, 0.0, 0.0]
+    assert privileged_state(arm, part)[0].tolist() == pytest.approx(expected, abs=2e-4)
+    found = privileged_state(arm, replace(part, factors=torch.tensor([[5.0, 6.0]])))
+    assert found[0, -2:].tolist() == [5.0, 6.0]
 
 
 def test_stored_observations_are_those_before_the_step(task):

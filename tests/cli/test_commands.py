@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from surgisoft.cli import MANY, run, spread
+from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import load_recording
 
 
@@ -449,3 +450,28 @@ def test_a_command_leaves_the_function_of_commands_in_place(capsys):
     assert surgisoft.cli.run(["recording", "nowhere.parquet"]) == 2
     assert surgisoft.cli.run(["recording", "nowhere.parquet"]) == 2
     assert capsys.readouterr().err.count("nowhere.parquet") >= 2
+
+
+def test_a_recording_that_is_there_is_refused_before_the_rig_moves(tmp_path, monkeypatch):
+    def moved(*_, **__):
+        raise AssertionError("the rig was driven")
+
+    monkeypatch.setattr("surgisoft.rig.trial.collect", moved)
+    there = tmp_path / "r.csv"
+    there.write_text("x")
+    assert run(["collect", "holds", "-o", str(there)]) == 2
+    assert there.read_text() == "x"
+
+
+def test_each_hidden_effect_has_its_own_strength(tmp_path, monkeypatch):
+    asked = {}
+
+    def noted(*_, **given):
+        asked.update(given)
+        raise InputError("asked")
+
+    monkeypatch.setattr("surgisoft.rig.trial.collect", noted)
+    line = ["collect", "holds", "-o", str(tmp_path / "r.csv"), "--hidden", "payload", "creep@20"]
+    assert run([*line, "--strength", "0.5", "2", "--seed", "3", "--trial", "4"]) == 2
+    assert [tuple(each) for each in asked["hidden"]] == [("payload", 0.5), ("creep", 2.0, 20.0)]
+    assert (asked["seed"], asked["trial"]) == (3, 4)

@@ -20,6 +20,7 @@ from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.model import Validation
 
 NAN = float("nan")
+INF = float("inf")
 
 
 @pytest.fixture(scope="module")
@@ -396,8 +397,9 @@ def live(**fields) -> SimpleNamespace:
         ({"detector": SimpleNamespace(judges=False)},
          "no change detector: its clean reference does not repeat its motions", "alarm"),
         ({"statistic": ()}, "no alarm; highest alarm level 0.00 of 1\n", "task"),
-        ({"alarms": (SimpleNamespace(since_s=4.0),), "written": ("a.csv", "b.csv")},
-         "error of the model: before the change 0.250 mm, after it 0.250 mm\n", "no alarm"),
+        ({"alarms": (SimpleNamespace(since_s=4.0),), "written": ("a.csv", "b.csv"),
+          "rms_mm": lambda a, b: {(-INF, 4.0): 0.25, (4.0, INF): 0.75}[a, b]},
+         "error of the model: before the change 0.250 mm, after it 0.750 mm\n", "no alarm"),
     ],
 )  # fmt: skip
 def test_run_prints_errors_and_what_the_detector_judged(

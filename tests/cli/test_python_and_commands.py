@@ -345,3 +345,56 @@ def test_every_command_is_compared_with_its_function():
     }
     assert compared.isdisjoint(reasons)
     assert compared | set(reasons) == set(COMMANDS)
+
+
+def test_every_option_of_run_reaches_its_argument(tmp_path, monkeypatch):
+    """No value is a default, so that none can stand in for another."""
+    asked = {}
+
+    def noted(policy, rig, model, **given):
+        asked.update(given, policy=policy, rig=rig, model=model)
+        raise InputError("asked")
+
+    monkeypatch.setattr("surgisoft.live.session.run", noted)
+    line = ["run", "scripted", "-o", str(tmp_path / "r.parquet"), "--rig", "virtual:seed=3"]
+    line += ["--model", "default", "--task", "track_square", "--minutes", "3", "--rate", "25"]
+    line += ["--clock", "simulated", "--before", "a.parquet", "b.parquet", "--clean", "45"]
+    line += ["--false-alarm", "7", "--stop-on-alarm", "--no-cameras", "--observer-gain", "0.4"]
+    line += ["--any-model", "--seed", "5", "--force"]
+    assert run(line) == 2
+    expected = {
+        "policy": "scripted",
+        "rig": "virtual:seed=3",
+        "model": Path("default"),
+        "task": "track_square",
+        "minutes": 3.0,
+        "rate_hz": 25.0,
+        "clock": "simulated",
+        "before": [Path("a.parquet"), Path("b.parquet")],
+        "reference_s": 45.0,
+        "alarm": AlarmDesign(false_alarm_h=7.0),
+        "stop_on_alarm": True,
+        "cameras": False,
+        "observer_gain": 0.4,
+        "any_model": True,
+        "seed": 5,
+        "force": True,
+        "output": tmp_path / "r.parquet",
+    }
+    assert {name: asked.get(name) for name in expected} == expected
+
+
+def test_every_option_of_compare_reaches_its_argument(tmp_path, monkeypatch):
+    recording = VirtualRig(0).record(make_protocol("holds", VirtualRig(0).limits, 60))[0]
+    save_recording(recording, tmp_path / "r.csv")
+    asked = {}
+
+    def noted(models, recordings, **given):
+        asked.update(given)
+        raise InputError("asked")
+
+    monkeypatch.setattr("surgisoft.diagnosis.compare.compare_all", noted)
+    line = ["compare", "default", str(tmp_path / "r.csv"), "--test", "--model-error", "0.7"]
+    assert run([*line, "--before", str(tmp_path / "r.csv"), "--paired", "never"]) == 2
+    assert [asked[name] for name in ("test", "error_mm", "paired")] == [True, 0.7, "never"]
+    assert len(asked["before"]) == 1

@@ -7,6 +7,7 @@ import pytest
 
 from surgisoft.diagnosis.beyond_history import RIDGES, beyond_history, sudden_turn
 from surgisoft.diagnosis.candidates import candidates
+from surgisoft.diagnosis.change_points import coarse, finer
 from surgisoft.diagnosis.cross_validation import split_of
 from surgisoft.diagnosis.evidence import sudden_gain
 from surgisoft.diagnosis.residuals import problem_of
@@ -57,6 +58,20 @@ def test_losses_are_those_of_plain_regressions():
     assert found.break_losses.sum() == pytest.approx(left, rel=0.01)
 
 
+def test_the_ridge_is_the_best_on_held_out_blocks():
+    """What the features explain well is not held back by the largest ridge."""
+    problem, features = posed(np.zeros(ROWS))
+    tip = 2.0 * features[:, 0]
+    residual = problem.residual.copy()
+    residual[:, -1, 0] += tip
+    measured = problem.predicted + residual
+    problem = replace(problem, measured=measured)
+    found = beyond_history(problem, features)
+    losses = [np.square(plain(problem, features, r)).sum() for r in RIDGES]
+    assert found.losses.sum() == pytest.approx(min(losses), rel=1e-3)
+    assert losses[-1] > 1.1 * min(losses)
+
+
 def test_a_knock_is_a_break_and_a_function_of_the_actuation_is_none():
     pressure = walk(ROWS)[:, 0]
     found = beyond_history(*posed(0.6 * (np.arange(ROWS) > 700)))
@@ -105,6 +120,28 @@ def test_a_sudden_turn_is_found_at_its_moment_and_leaves_the_noise():
     assert found.at == pytest.approx(0.6, abs=1e-6)
     assert found.losses.sum() == pytest.approx(noise_of(problem), rel=0.1)
     assert np.square(problem.residual).sum() > 5 * found.losses.sum()
+
+
+def test_a_sudden_shift_of_the_whole_body_is_one_too():
+    """0.5 mm of all key points along y at three fifths: no turn does that."""
+    made = recording(np.zeros(ROWS), walk(ROWS))
+    moved = made.key_points_mm.copy()
+    moved[np.arange(ROWS) >= 0.6 * ROWS, :, 1] += 0.5
+    model = still_model()
+    model.validation = Validation(1e-3, (1e-3,) * 3, ROWS)
+    problem = problem_of(model, [replace(made, key_points_mm=moved)])
+    found = sudden_turn(split_of(problem), problem.predicted)
+    assert found.losses.sum() == pytest.approx(noise_of(problem), rel=0.1)
+    assert np.square(problem.residual).sum() > 5 * found.losses.sum()
+
+
+def test_moments_between_two_that_were_tried_come_up_to_these():
+    """With eight steps between two neighbours the outermost are an eighth away from them."""
+    tried = coarse()
+    step = tried[1] - tried[0]
+    near = finer(tried[10])
+    np.testing.assert_allclose(near[[0, 7, -1]], tried[10] + step * np.array([-7, 0, 7]) / 8.0)
+    np.testing.assert_allclose(np.diff(near), step / 8.0)
 
 
 def test_what_grows_is_no_sudden_turn():

@@ -146,7 +146,12 @@ def test_a_model_from_before_a_change_has_learned_nothing_of_it():
 
 @pytest.mark.parametrize(
     ("missing", "motions", "reason"),
-    [(-0.3, 200, "repeatability"), (0.3, 200, "schedule"), (0.3, 6, "few_data")],
+    [
+        (-0.3, 200, "repeatability"),
+        (0.3, 200, "schedule"),
+        (0.3, 12, "schedule"),
+        (0.3, 11, "few_data"),
+    ],
 )
 def test_a_paired_difference_is_never_blamed_on_the_model(missing, motions, reason):
     """Even if a static function explains most of it, or it is as small as the validated error."""

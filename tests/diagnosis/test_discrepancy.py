@@ -26,3 +26,11 @@ def test_errors_grow_along_the_body():
     matrix = body_covariance(np.array([0.1, 0.3, 0.6]))
     assert np.diag(matrix) == pytest.approx(np.array([0.01, 0.09, 0.36]) / 3)
     assert matrix[0, 2] == matrix[0, 0]
+
+
+def test_errors_of_opposite_directions_have_less_in_common():
+    """A share of 0.3 of the error follows the direction: 0.7 - 0.3 where both chambers turn."""
+    x, up = np.array([[0.2, -0.4]]), np.ones((1, 2))
+    assert kernel(x, up, x, up).item() == pytest.approx(1.0)
+    assert kernel(x, up, x, -up).item() == pytest.approx(0.4)
+    assert kernel(x, up, x, up * [1.0, -1.0]).item() == pytest.approx(0.7)

@@ -156,6 +156,7 @@ def test_another_vibration_is_no_load(model, unloaded):
     assert min(left) > 0.97
     # Two sines, of amplitude 1 mm along x and y, in either recording.
     assert both.pairs.free_mm[-1] == pytest.approx(np.sqrt(2), rel=0.15)
+    assert both.pairs.noise_mm[-1] == pytest.approx(both.pairs.free_mm[-1]), "more than the noise"
 
 
 def test_a_load_acts_on_the_motion_that_both_recordings_share(model):

@@ -22,9 +22,18 @@ from surgisoft.diagnosis.diagnose import (
 )
 from surgisoft.diagnosis.known_error import known_error
 from surgisoft.diagnosis.pages import diagnosis as page
-from surgisoft.diagnosis.pairs import LEAST_ROWS, before_and_after
-from surgisoft.diagnosis.residuals import residual_table
+from surgisoft.diagnosis.pairs import (
+    LEAST_ROWS,
+    RunSignal,
+    before_and_after,
+    matches,
+    paired_discrepancy,
+    rms_by_point,
+    slope_error,
+)
+from surgisoft.diagnosis.residuals import LEAST_DISCREPANCY, model_discrepancy, residual_table
 from surgisoft.errors import InputError
+from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import Recording, load_recording, save_recording
 from surgisoft.report import charts
@@ -134,6 +143,105 @@ def test_only_the_common_part_is_paired(model):
     assert pairs.stretches[0].delay_s == pytest.approx(-PERIOD_S * (ROWS // 2), abs=0.1)
 
 
+def test_rows_are_paired_where_the_actuation_agrees_now_and_over_the_past():
+    """One row off by three times what counts as the same, later thirty rows by one and a half.
+
+    The one row is too few for the past of 2 s, 41 rows, and too far off itself. The thirty rows are
+    near enough each, and the mean square of the past exceeds 1 from 19 of them on until fewer than
+    19 are in it.
+    """
+    alike, t_s = np.array([0.02]), 0.05 * np.arange(1200)
+    wave = 0.3 * np.sin(0.7 * t_s) + 0.1 * np.sin(2.3 * t_s + 1.0)
+    off = np.zeros(1200)
+    off[600] = 3.0 * alike[0]
+    off[800:830] = 1.5 * alike[0]
+    rows = np.arange(1200)
+    before, after = (
+        RunSignal(0, name, rows, t_s, values[:, None])
+        for name, values in (("before", wave), ("after", wave + off))
+    )
+    (match,) = matches(after, before, alike)
+    assert match.delay_s == pytest.approx(0.0, abs=0.02)
+    inner = np.arange(5, 1195)  # the delay is known to a fraction of a sample
+    left_out = inner[~match.inside[inner]]
+    assert left_out[0] == 600
+    assert left_out[1] == pytest.approx(818, abs=3)
+    assert left_out[-1] == pytest.approx(851, abs=3)
+    assert len(left_out) == pytest.approx(35, abs=5)
+
+
+@pytest.mark.parametrize("differs", ["measured", "commanded"])
+def test_rows_are_paired_by_the_commands_or_by_what_was_measured(model, differs):
+    """Sensors that read a fifth more, or commands of another motion, do not part recordings."""
+    motion = smooth_walk(3)
+    after, before = (
+        replace(each, commanded=each.measured.copy())
+        for each in (made(motion, 1.0), made(motion, 0.0, seed=2))
+    )
+    other = {"measured": 1.2 * after.measured, "commanded": smooth_walk(7)(after.t_s)}
+    after = replace(after, **{differs: other[differs]})
+    assert paired(model, after, before).pairs.paired.mean() > 0.9
+
+
+def test_the_share_that_is_paired_is_that_of_the_training_rows(model):
+    """BEFORE ends where the held-out rows of AFTER begin."""
+    motion = smooth_walk(3)
+    change = paired(model, made(motion, 0.0), made(motion, 0.0, rows=3 * ROWS // 4, seed=2)).change
+    assert change.paired_share > 0.97
+
+
+def test_the_error_of_slopes_by_hand(model):
+    """For three chambers 2.055 times the error over the motion; all of it where nothing moves."""
+    arm, rig = default_arm(), VirtualRig(0)
+    table = residual_table(arm, [rig.record(make_protocol("mixed", rig.limits, 600, seed=1))[0]])
+    motion = table.predicted_mm - table.predicted_mm.mean(axis=0)
+    error, moved = (
+        np.sqrt(np.mean(each))
+        for each in (model_discrepancy(arm, table.noise_mm) ** 2, np.square(motion).sum(2))
+    )
+    assert slope_error(table) == pytest.approx(2.0554 * error / moved, rel=1e-3)
+    assert slope_error(table) < 0.5
+    still = residual_table(model, [made(smooth_walk(3), 0.0, rows=600)])
+    assert slope_error(still) == 1.0
+
+
+def test_a_noise_that_is_stated_too_large_does_not_make_repeats_perfect(model):
+    """Repeats that differ by a tenth of the stated noise: half of it is what is taken."""
+    once = smooth_walk(3)(PERIOD_S * np.arange(ROWS // 2))
+    twice = np.concatenate([once, once])
+    before = replace(recording(unlearned(twice), twice, seed=2), noise_mm=10.0 * NOISE_MM)
+    pairs = paired(model, made(smooth_walk(3), 0.0, rows=ROWS // 2), before).pairs
+    assert pairs.source == "repeats"
+    np.testing.assert_allclose(pairs.repeatability_mm, 0.5 * pairs.earlier.noise_mm)
+
+
+def test_what_was_wrong_before_is_not_extrapolated(model):
+    """BEFORE covers the lower half of the range, where the error is up to so large."""
+    half = made(lambda t_s: 0.5 * smooth_walk(3)(t_s), 0.0)
+    whole = made(smooth_walk(8), 0.0, seed=2)
+    before = residual_table(model, [half])
+    found = known_error(residual_table(model, [whole]), before)
+    assert found.ratio < 0.5
+    left, error = (np.sqrt(np.mean(x**2)) for x in (found.reference.residual, before.residual_mm))
+    assert found.ratio == pytest.approx(left / error, rel=0.05), "of what fits without the row left"
+    assert np.abs(found.correction_mm).max() < 1.08 * np.abs(before.residual_mm).max()
+
+
+def test_a_row_has_one_partner_in_a_run():
+    """A motion that repeats itself every 10 s, in a part of BEFORE at another delay only."""
+    t_s, rows = 0.05 * np.arange(1600), np.arange(1600)
+    wave = 0.3 * np.sin(2.0 * np.pi * t_s / 10.0)[:, None]
+    other = wave.copy()
+    other[600:1000] = 0.3 * np.sin(2.0 * np.pi * t_s[600:1000, None] / 3.0)
+    before, after = (
+        RunSignal(0, name, rows, t_s, values)
+        for name, values in (("before", other), ("after", wave))
+    )
+    found = matches(after, before, np.array([0.02]))
+    assert len(found) > 1
+    assert np.sum([match.inside for match in found], axis=0).max() == 1
+
+
 def test_repeated_runs_of_before_are_averaged_and_show_its_repeatability(model):
     """Each recording has a shift of its own, of 0.3 mm RMS in each coordinate of the tip."""
     motion, rng = smooth_walk(7), np.random.default_rng(0)
@@ -204,6 +312,59 @@ def test_noise_of_a_measured_actuation_is_no_change(model):
     table = residual_table(steep, [take()])
     raw = np.diff(table.predicted_mm, axis=0)
     assert np.nanstd(fast) < 0.35 * raw.std()
+
+
+def test_a_difference_of_the_actuation_is_corrected_by_the_model():
+    """Both recordings are the model's own motion; one chamber has 0.3 kPa more in AFTER.
+
+    Half of what the sensors show besides, from sample to sample, is real.
+    """
+    arm, rig = default_arm(), VirtualRig(0)
+    base = rig.record(make_protocol("mixed", rig.limits, 1200, seed=1))[0]
+    t_s = PERIOD_S * np.arange(1200)
+    pace = np.array([0.7, 1.1, 1.9])
+    waves = 20.0 + 15.0 * np.sin(pace * t_s[:, None]) * np.cos(0.31 * pace * t_s[:, None])
+
+    noise = np.random.default_rng(0).normal(0.0, 0.02, waves.shape)
+
+    def own(more_kPa, real, name):
+        asked = waves + np.array([more_kPa, 0.0, 0.0])
+        moved = replace(
+            base, name=name, t_s=t_s, run=np.zeros(1200, int), measured=asked, commanded=asked
+        )
+        history = history_of([replace(moved, measured=asked + real * noise)])
+        with torch.inference_mode():
+            points = history.rows(arm.predict(history)).double().numpy()
+        return replace(moved, measured=asked + (real > 0.0) * noise, key_points_mm=points)
+
+    before, after = own(0.0, 0.0, "before"), own(0.3, 0.5, "after")
+    pairs = before_and_after(residual_table(arm, [after]), [before]).pairs
+    there = pairs.paired
+    assert there.mean() > 0.9
+    moved = rms_by_point(after.key_points_mm[there] - before.key_points_mm[there])[-1]
+    assert moved > 0.1
+    assert rms_by_point(pairs.correction_mm[there])[-1] == pytest.approx(moved, rel=0.05)
+    assert rms_by_point(pairs.change_mm[there])[-1] < 0.1 * moved
+
+    # Nothing that is estimated for the training rows follows from the held-out ones.
+    held = pairs.after.held_out
+    shaken = after.key_points_mm.copy()
+    shaken[held] += 3.0 * np.sin(2.1 * np.arange(held.sum()))[:, None, None]
+    table = residual_table(arm, [replace(after, key_points_mm=shaken)])
+    other = before_and_after(table, [before]).pairs
+    np.testing.assert_array_equal(other.correction_mm[~held], pairs.correction_mm[~held])
+    for name in ("free_mm", "noise_mm", "discrepancy_mm", "tolerance_mm"):
+        np.testing.assert_array_equal(getattr(other, name), getattr(pairs, name), err_msg=name)
+
+
+def test_the_systematic_error_of_a_pair_by_hand():
+    """Twice the slow variance of one recording, and a tenth of the correction."""
+    correction = np.zeros((10, 2, 3))
+    correction[:, 1, 0] = 2.0
+    found = paired_discrepancy(np.array([0.3, 0.4]), correction, np.zeros(2), 0.1)
+    np.testing.assert_allclose(found, [np.sqrt(0.18), np.sqrt(0.32 + 0.04)])
+    quiet = paired_discrepancy(np.zeros(2), correction, np.array([1.0, 2.0]), 0.0)
+    np.testing.assert_allclose(quiet, LEAST_DISCREPANCY * np.array([1.0, 2.0]))
 
 
 def test_a_run_at_rest_is_paired_beside_those_that_move(model):

@@ -10,6 +10,7 @@ import pytest
 
 from surgisoft.diagnosis import selection
 from surgisoft.diagnosis.candidates import candidates
+from surgisoft.diagnosis.criteria import SEARCH
 from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.diagnosis.residuals import problem_of
 from surgisoft.diagnosis.selection import ModelSelection, Option, RelaxedFit, Score, propose
@@ -250,3 +251,9 @@ def test_what_is_reached_can_be_explained():
     assert whole == pytest.approx(9.0)
     assert (before.sum() - after.sum()) / whole <= 1.0
     assert ModelSelection.explainable(known, before, []) == pytest.approx(4.0)
+
+
+def test_each_of_the_first_twelve_amplitudes_costs_three_thousandths():
+    assert SEARCH.priced(2.0, 0) == 2.0
+    assert SEARCH.priced(2.0, 4) == pytest.approx(2.0 * (1.0 - 0.012))
+    assert SEARCH.priced(2.0, 12) == SEARCH.priced(2.0, 360) == pytest.approx(2.0 * (1.0 - 0.036))

@@ -16,6 +16,8 @@ from surgisoft.cli import run as command
 from surgisoft.diagnosis.data_quality import alarm_hints
 from surgisoft.diagnosis.residuals import Sealed
 from surgisoft.errors import InputError
+from surgisoft.live import session
+from surgisoft.live.change import Charts
 from surgisoft.live.session import LEAD_IN_S, elsewhere, run
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.recordings import load_recording
@@ -168,7 +170,16 @@ def test_the_view_holds_every_sample(changed, tmp_path):
     assert any(found.alarms[0].sentence in text[0] for text in texts)
 
 
-def test_a_recording_of_the_morning_is_the_reference(schedule):
+def test_a_recording_of_the_morning_is_the_reference(schedule, monkeypatch):
+    """A run begins with a reset and ends with one, at which the charts begin anew."""
+    paused = []
+
+    class Watched(Charts):
+        def pause(self):
+            paused.append(self)
+            super().pause()
+
+    monkeypatch.setattr(session, "Charts", Watched)
     morning = surgisoft.collect(schedule, VirtualRig(0, take=5))
     found = run(
         schedule, "virtual:hidden=payload@20", before=morning, stop_on_alarm=True, **SIMULATED
@@ -178,6 +189,7 @@ def test_a_recording_of_the_morning_is_the_reference(schedule):
     assert found.recording.t_s[-1] == pytest.approx(found.alarms[0].at_s, abs=0.11)
     clean = run(schedule, "virtual:noise_seed=6", before=morning, minutes=0.5, **SIMULATED)
     assert not clean.alarms
+    assert len(paused) == 2 * (len(found.recording.runs) + len(clean.recording.runs))
 
 
 def test_a_policy_goes_on_to_new_goals(tmp_path):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import rerun.blueprint as rrb
 
 from surgisoft.error_scale import bar_length, error_scale
 from surgisoft.errors import InputError
@@ -106,6 +107,24 @@ def test_several_models_have_one_scale(tmp_path):
     texts = column(path, "/events", "TextLog:text", "time")
     assert list(texts) == [2 * 10**9]
     assert "worst" in texts[2 * 10**9][0]
+
+
+def test_the_title_of_a_view_states_the_rms_error(tmp_path, monkeypatch):
+    """Errors of 1 and 7 mm in equal numbers: 5 mm, and not their mean of 4."""
+    titles, space = [], rrb.Spatial3DView
+
+    def noted(**given):
+        titles.append(given["name"])
+        return space(**given)
+
+    monkeypatch.setattr(rrb, "Spatial3DView", noted)
+    measured = np.zeros((20, 2, 3))
+    measured[:, 1, 2] = 70.0
+    measured[:, 1, 0] = np.linspace(-20.0, 20.0, 20)
+    predicted = measured + [[[1.0, 0.0, 0.0]], [[7.0, 0.0, 0.0]]] * 10
+    write_comparison(0.1 * np.arange(20), measured, predicted, "x", tmp_path / "c.rrd")
+    (title,) = titles
+    assert "error 5 mm" in title
 
 
 def test_the_scale_is_that_of_the_worst_model_in_round_numbers():

@@ -21,7 +21,7 @@ from surgisoft.tasks.episodes.file import load_episode, save_episode
 from surgisoft.tasks.episodes.log import EpisodeRecorder
 from surgisoft.tasks.world.pytree import rows
 from surgisoft.tasks.world.random_streams import streams
-from surgisoft.tasks.world.respiration import Respiration, lujan
+from surgisoft.tasks.world.respiration import OrganMotion, Respiration, lujan
 from tests.tasks.scripted import with_gap
 
 PLACE = open_scene(PHANTOM)
@@ -71,6 +71,14 @@ def test_breaths_are_irregular_and_continuous(task):
     assert spread.item() == pytest.approx(0.2, rel=0.1)
     rate = 60.0 / breaths.period_s.mean(1)
     assert rate.mean().item() == pytest.approx(15.0, abs=0.3)
+    first = (breaths.amplitude_mm[:, 0], breaths.period_s[:, 0], breaths.period_s.mean(1), mean)
+    own = torch.stack((first[0] / mean, first[1] / first[2], mean, rate))
+    apart = torch.corrcoef(own)
+    assert apart[0, 1].abs() < 0.1, "amplitude and period of a breath"
+    assert apart[2, 3].abs() < 0.1, "mean amplitude and rate of an episode"
+    phase = -breaths.begins_s[:, 0] / breaths.period_s[:, 0]
+    counts = torch.histc(phase, 4, 0.0, 1.0) / len(phase)
+    torch.testing.assert_close(counts, torch.full((4,), 0.25), rtol=0, atol=0.04)
     one = rows(breaths, torch.tensor([0]))
     moments = torch.linspace(0.0, 60.0, 10001).tolist()
     moved = torch.cat([motion.displacement_mm(one, at)[0] for at in moments])
@@ -210,3 +218,32 @@ def test_bad_respiration_is_one_line():
         Respiration(feet=(0.0, 0.0, 2.0))
     with pytest.raises(InputError, match="gate"):
         BreathingAblationConfig(mode="gate")
+
+
+def test_the_organ_turns_about_the_lesion_as_it_moves():
+    """10 mm towards the feet (y) and 2.5 mm forwards (z), turned by 1 degree from z towards -y."""
+    plain = Respiration(shorten_per_mm=0.0, deepen_per_mm=0.0, shear_per_mm=0.0)
+    motion = OrganMotion(plain, [], np.zeros(3), 60.0, torch.device("cpu"))
+    found = motion.placement(torch.tensor([10.0])).points(torch.tensor([[0.0, 0.0, 10.0]]))
+    angle = math.radians(1.0)
+    expected = [0.0, 10.0 - 10.0 * math.sin(angle), 2.5 + 10.0 * math.cos(angle)]
+    np.testing.assert_allclose(found[0], expected, atol=1e-4)
+
+
+def test_targets_ahead_follow_the_present_rate(task):
+    state = Episodes(task).seeded(3, 16)
+    now, rate = task.displacement_mm(state)
+    assert rate.abs().max() > 5.0
+    for ahead in (0, 2):
+        later = (now + 0.1 * ahead * rate).clamp(min=0.0)
+        expected = task.motion.placement(later).points(task.resting_mm(state, ahead))
+        torch.testing.assert_close(task.target_mm(state, ahead), expected)
+
+
+def test_a_gated_camera_stays_and_only_a_beam_that_burns_has_an_error_on_tissue():
+    gated = BreathingAblation(replace(QUICK, mode="gated"))
+    state = Episodes(gated).seeded(3, 8)
+    assert gated.displacement_mm(state)[0].max() > 1.0
+    assert torch.equal(gated.watched_mm(state), gated.centre_mm(state))
+    assert not state.goal.fired.any()
+    assert gated.measures(state)["tissue_error_mm"].isnan().all()

@@ -232,9 +232,10 @@ def test_the_target_goes_round_once_at_even_speed():
     assert path[30 + 50, 1] - task.centre[1] == pytest.approx(10.0, abs=1e-4)
 
 
-def test_the_bodys_target_is_a_shape_of_the_arm_by_hand():
-    """Two sine waves of 12 s and 7 s about 20 kPa, given to the arm model alone."""
-    task = TrackBody()
+@pytest.mark.parametrize("mean_kPa", [20.0, 50.0])
+def test_the_bodys_target_is_a_shape_of_the_arm_by_hand(mean_kPa):
+    """Two sine waves of 12 s and 7 s, cut off at the range, given to the arm model alone."""
+    task, cut = TrackBody(TrackBodyConfig(mean_kPa=mean_kPa)), 0
     state = Episodes(task).seeded(4, 2)
     phase, model = state.goal.phase.double(), default_arm()
     for step, moved_s in ((10, 0.0), (30, 0.0), (91, 6.1)):
@@ -243,13 +244,35 @@ def test_the_bodys_target_is_a_shape_of_the_arm_by_hand():
             15.0 * share * (2.0 * math.pi * (moved_s / period + phase[:, i])).sin()
             for i, (share, period) in enumerate(((0.6, 12.0), (0.4, 7.0)))
         ]
-        pressure = (20.0 + sum(wave)).float()
+        asked = (mean_kPa + sum(wave)).float()
+        pressure = asked.clamp(task.arm.low, task.arm.high)
+        cut += int((pressure != asked).sum())
         still = model.initial_state(2, pressure)
         _, points = model.step(still, torch.zeros(2, 3), 0.1)
         torch.testing.assert_close(task.target_mm(now), points, rtol=0, atol=2e-3)
         own = now.world.arms["arm"].points_mm
         gap = (own - points).norm(dim=2)[:, 1:]
         torch.testing.assert_close(task.errors_mm(now), gap, rtol=0, atol=4e-3)
+    assert (cut > 0) == (mean_kPa == 50.0)
+
+
+def test_reward_and_errors_of_a_body_by_hand():
+    """Key points that lie 0.1, 0.2, 0.3 ... mm from their targets, the base where it is."""
+    task = TrackBody()
+    state = Episodes(task).seeded(4, 1)
+    steps = torch.tensor([task.approach + 5])
+    state = replace(state, world=replace(state.world, steps=steps))
+    points = task.target_mm(state)
+    count = points.shape[1] - 1
+    points[0, 1:, 0] += 0.1 * torch.arange(1.0, count + 1.0)
+    part = replace(state.world.arms["arm"], points_mm=points)
+    state = replace(state, world=replace(state.world, arms={"arm": part}))
+    mean = 0.1 * (count + 1) / 2
+    terms, measures = task.rewards(state)["arm"], task.measures(state)
+    assert terms["body"].item() == pytest.approx(math.exp(-mean), rel=1e-4)
+    assert terms["fine"].item() == pytest.approx(math.exp(-mean / 0.1), rel=1e-3)
+    assert measures["error_mm"].item() == pytest.approx(mean, rel=1e-4)
+    assert measures["tip_mm"].item() == pytest.approx(0.1 * count, rel=1e-4)
 
 
 def test_paths_by_hand():
@@ -279,14 +302,32 @@ def test_the_plane_is_where_the_config_states():
 
 
 def test_the_predicted_error_is_that_of_a_step_without_action():
-    """Simulated: commands held, pumps still catching up, chambers reversing."""
+    """Simulated: commands held, pumps still catching up, chambers reversing, the target moving."""
     task = track_circle()
     episodes = Episodes(task)
-    state, _, _ = played(episodes, 64, 20)
+    state, _, _ = played(episodes, 64, task.approach + 10)
+    assert (task.target_mm(state, 1) - task.target_mm(state)).norm(dim=1).min() > 0.1
     predicted = episodes.observe(state)["arm"][:, 27:30].sinh() * task.config.fine_mm
     after, _ = episodes.step(state, {"arm": torch.zeros(64, 3)})
     tip = after.world.arms["arm"].points_mm[:, -1]
     torch.testing.assert_close(predicted, task.target_mm(after) - tip, rtol=1e-4, atol=1e-4)
+
+
+def test_errors_ahead_by_hand():
+    """In both scales, of targets that move by more in two steps than in one."""
+    task = track_circle()
+    episodes = Episodes(task)
+    state, _, _ = played(episodes, 4, task.approach + 10)
+    (blocks,) = task.blocks(state).values()
+    seen = {block.name: value for block, value in blocks.items()}
+    tip = state.world.arms["arm"].points_mm[:, -1]
+    for ahead, (wide, fine) in enumerate(
+        (("error", "fine_error"), ("error_1", "fine_error_1"), ("error_2", None))
+    ):
+        off = task.target_mm(state, ahead) - tip
+        torch.testing.assert_close(seen[wide], off.asinh())
+        if fine is not None:
+            torch.testing.assert_close(seen[fine], (off / 0.1).asinh(), rtol=1e-4, atol=1e-4)
 
 
 def test_the_history_holds_the_last_steps_newest_first():
@@ -325,6 +366,11 @@ def test_noise_is_seen_but_not_scored():
     still = {"arm": torch.zeros(500, 3)}
     (a, one), (b, other) = noisy.step(a, still), plain.step(b, still)
     torch.testing.assert_close(one.rewards["arm"], other.rewards["arm"])
+    blocks = [e.task.blocks(s)["arm"] for e, s in ((noisy, a), (plain, b))]
+    more = {block.name: value - blocks[1][block] for block, value in blocks[0].items()}
+    newest, half = more["pressure_history"][:, :3], 0.5 * (plain.task.arm.high - plain.task.arm.low)
+    assert newest.std().item() == pytest.approx(0.3 * 2**0.5, rel=0.1)
+    assert (half * more["pressure"]).std().item() == pytest.approx(0.3, rel=0.1)
     part = a.world.arms["arm"]
     assert (part.seen_mm - part.points_mm).std().item() == pytest.approx(0.5, rel=0.05)
     assert (part.seen_kPa - part.pressure).std().item() == pytest.approx(0.3, rel=0.1)

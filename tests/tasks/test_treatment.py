@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from surgisoft.scene.folder import open_scene
 from surgisoft.scene.spec import PHANTOM
 from surgisoft.tasks.world.arm import Randomisation
 from surgisoft.tasks.world.scene import NOT_RANDOMISED
-from surgisoft.tasks.world.treatment import rings, treatment_of
+from surgisoft.tasks.world.treatment import rings, treatment_of, windows
 
 BAND_MM, POINTS = 2.0, 24
 
@@ -97,3 +98,14 @@ def test_a_plan_that_may_answer_otherwise_is_asked_each_time(counted):
             treatment_of(plan, open_scene(PHANTOM), NOT_RANDOMISED, BAND_MM, POINTS)
     assert changing.asked == 2
     assert len(ASKED) == 2
+
+
+def test_the_window_around_a_point_ends_with_an_open_path_and_goes_round_a_closed_one():
+    """Eleven points in steps of 1 mm, or ten around 10 mm; 2 mm on either side have to be seen."""
+    for closed, count, first in ((False, 11, [0, 0, 0, 1, 2]), (True, 10, [8, 9, 0, 1, 2])):
+        points = np.arange(count)[:, None] * np.ones(3)
+        path = SimpleNamespace(points_mm=points, normals=-points, length_mm=10.0, closed=closed)
+        seen, normals = windows(path, 2.0, 5)
+        assert seen[0, :, 0].tolist() == first
+        assert seen[5, :, 0].tolist() == [3, 4, 5, 6, 7]
+        np.testing.assert_array_equal(normals, -seen)

@@ -1,0 +1,113 @@
+"""The runner of an exported controller: what it gives to the graph, and what it keeps."""
+
+import math
+
+import numpy as np
+import pytest
+
+from surgisoft.agents.controller_runner import Controller
+
+LEAVES = {"steps": (), "goal.start": (), "arms.arm.plant.lowest_kPa": (2,)}
+LEAVES |= {"arms.arm.plant.highest_kPa": (2,)}
+
+
+class Graph:
+    """Stands in for the graph of an arm with two chambers: a sample later, a command per call."""
+
+    def __init__(self):
+        self.given = []
+
+    def __call__(self, given):
+        self.given.append({name: value.copy() for name, value in given.items()})
+        state = given["state"].copy()
+        state[0, 0] += 1.0
+        number = float(len(self.given))
+        return [state, np.array([[number, 10.0 + number]]), np.zeros((1, 1, 3))]
+
+
+@pytest.fixture
+def driven():
+    """A controller whose episodes have three decisions, and the graph that it calls."""
+    leaves, first = [], 0
+    for name, shape in LEAVES.items():
+        last = first + math.prod(shape)
+        leaves.append({"name": name, "shape": list(shape), "first": first, "last": last})
+        first = last
+    arm = {"name": "arm", "chambers": 2, "key_points": 1}
+    arm |= {"lowest_kPa": [0.0, 5.0], "highest_kPa": [60.0, 50.0]}
+    about = {
+        "episode_steps": 3,
+        "controller": {
+            "arms": [arm],
+            "state": {"leaves": leaves, "initial": [0.0, 0.25, 0.0, 5.0, 60.0, 50.0]},
+            "signals": [],
+            "goal": [{**leaves[1], "default": 0.25}],
+            "outputs": ["next_state", "arm_command_kPa", "arm_estimate_mm"],
+        },
+    }
+    graph = Graph()
+    return Controller.of(about, graph), graph
+
+
+REST, POINTS = [1.0, 2.0], np.zeros((1, 3))
+
+
+def test_other_limits_are_never_beyond_those_of_the_training(driven):
+    controller, _ = driven
+    controller.limit([-10.0, 20.0], [70.0, 30.0])
+    assert controller.state("arms.arm.plant.lowest_kPa").tolist() == [0.0, 20.0]
+    assert controller.state("arms.arm.plant.highest_kPa").tolist() == [60.0, 30.0]
+    controller.reset()
+    assert controller.state("arms.arm.plant.lowest_kPa").tolist() == [0.0, 5.0]
+    assert controller.state("arms.arm.plant.highest_kPa").tolist() == [60.0, 50.0]
+
+
+def test_an_episode_begins_with_its_own_goal_and_ends_after_its_decisions(driven):
+    controller, graph = driven
+    assert controller.begin(REST, POINTS, REST, 0.1, goal={"start": 0.5}).tolist() == [1.0, 11.0]
+    assert graph.given[-1]["state"][0, 1] == 0.5
+    assert graph.given[-1]["begin"] == [1.0]
+    assert (controller.steps, controller.done) == (1, False)
+    controller.step(REST, POINTS, 0.1)
+    assert graph.given[-1]["begin"] == [0.0]
+    assert (controller.steps, controller.done) == (2, False)
+    controller.step(REST, POINTS, 0.1)
+    assert (controller.steps, controller.done) == (3, True)
+    controller.begin(REST, POINTS, REST, 0.1)
+    assert graph.given[-1]["state"][0, 1] == 0.25, "not the goal of the episode before"
+
+
+def test_the_set_points_in_force_are_those_returned_last_or_those_that_are_given(driven):
+    controller, graph = driven
+    controller.begin(REST, POINTS, [3.0, 4.0], 0.1)
+    assert graph.given[-1]["arm_commanded_kPa"].tolist() == [[3.0, 4.0]]
+    controller.step(REST, POINTS, 0.05)
+    assert graph.given[-1]["arm_commanded_kPa"].tolist() == [[1.0, 11.0]]
+    controller.step(REST, POINTS, 0.05, commanded_kPa=[0.5, 6.0])
+    assert graph.given[-1]["arm_commanded_kPa"].tolist() == [[0.5, 6.0]]
+    assert graph.given[-1]["arm_pressure_kPa"].tolist() == [REST]
+    assert graph.given[-1]["dt_s"] == pytest.approx([0.05])
+
+
+def test_after_a_reset_an_episode_has_to_begin(driven):
+    controller, _ = driven
+    controller.begin(REST, POINTS, REST, 0.1)
+    controller.reset()
+    assert (controller.steps, controller.outputs) == (0, {})
+    with pytest.raises(ValueError, match="step before begin"):
+        controller.step(REST, POINTS, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("pressure", "dt_s", "message"),
+    [
+        (REST, -0.1, "dt_s is -0.1, expected 0 s or more"),
+        (REST, math.inf, "dt_s is inf"),
+        ([1.0, math.nan], 0.1, "expected finite numbers"),
+    ],
+)
+def test_a_sample_that_cannot_be_is_refused(driven, pressure, dt_s, message):
+    controller, graph = driven
+    with pytest.raises(ValueError, match=message):
+        controller.observe(pressure, POINTS, REST, dt_s)
+    assert not graph.given

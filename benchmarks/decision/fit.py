@@ -71,6 +71,7 @@ def sample(
     `right` is 0 or 1; for `first` (E,) whether each effect is missing. first: the fitted model of
     that name, whose probabilities are a feature of `two`.
     """
+    assert name != "two" or first is not None, "`two` is fitted after `first`"
     answer = []
     for case in cases:
         if case.label == "setup" or not case.evidence.effects:
@@ -93,17 +94,14 @@ def sample(
             pair = [one.effects for one in case.evidence.proposals if len(one.effects) == 2]
             if case.label != "known" or not pair or case.size < WEAK:
                 continue
-            assert first is not None, "`two` is fitted after `first`"
             right = np.array(float(set(pair[0]) == set(case.truth)))
-            shares = shares_of(case.evidence, first)
-            answer.append((features_of(name, case.evidence, shares), right, case))
-            continue
         else:
             names = [one.effect for one in case.evidence.effects]
             right = np.array([float(one in case.truth) for one in names])
             if case.label != "known" or not right.any() or case.size < WEAK:
                 continue
-        answer.append((features_of(name, case.evidence), right, case))
+        shares = shares_of(case.evidence, first) if name == "two" and first is not None else None
+        answer.append((features_of(name, case.evidence, shares), right, case))
     return answer
 
 
@@ -345,9 +343,9 @@ def fit(cases: Sequence[Labelled], command: str = "") -> dict:
     samples, settings = {"first": sample("first", cases)}, {}
     settings["first"] = setting_of("first", samples["first"])
     first = fit_one("first", samples["first"], *_values(settings["first"]))
-    for name in FEATURES:
+    for name in [each for each in FEATURES if each != "first"]:
         samples[name] = sample(name, cases, first)
-        settings[name] = settings.get(name) or setting_of(name, samples[name])
+        settings[name] = setting_of(name, samples[name])
     models = {}
     for name, model in _models(cases, settings).items():
         models[name] = {

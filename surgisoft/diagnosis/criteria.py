@@ -77,9 +77,9 @@ class Worth:
     """The missing effect is one of two that are named as a set. A wrong set costs this share of a
     wrong name: its reader makes an experiment, and does not change the model."""
     half_pair: float = 0.25
-    """One of two effects that are named together is missing, the other not: half of
-    `first_of_pair`, which leaves a missing effect out where this adds one, and `amend` shows that
-    the other one does nothing."""
+    """One of two effects that are named together is missing, the other not. Half of
+    `first_of_pair`: there a missing effect is left out, here one that is not missing is added.
+    `amend` shows that it does nothing."""
     first_of_pair: float = 0.5
     """One effect is named, alone or in a set, and another one is missing too."""
     wrong_unknown: float = -1.4

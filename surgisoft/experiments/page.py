@@ -185,10 +185,13 @@ def markdown(results: Results) -> str:
 def rules(results: Results) -> str:
     """Definition of success in one sentence: the rule of the task, and no abort."""
     spec = results.experiment
-    rule = spec.of.success_rule
-    varied = [vary.field.removeprefix("task.") for vary in spec.vary if vary.field[:5] == "task."]
-    of_setting = f" ({', '.join(varied)}: the setting's value)" if rule and varied else ""
-    return f"Success: {f'{rule(spec.task)}{of_setting}; ' if rule else ''}nothing is aborted."
+    if spec.of.success_rule is None:
+        return "Success: nothing is aborted."
+    rule = spec.of.success_rule(spec.task)
+    varied = [vary.field.removeprefix("task.") for vary in spec.vary]
+    named = ", ".join(field for field in varied if f"({field})" in rule)
+    of_setting = f" ({named}: the setting's value)" if named else ""
+    return f"Success: {rule}{of_setting}; nothing is aborted."
 
 
 def _outcomes(results: Results) -> Section:

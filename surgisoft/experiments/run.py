@@ -152,7 +152,7 @@ def check_playable(spec: Experiment) -> float:
     """Raise an InputError unless lesions lie on the organ and controllers fit their arms.
 
     Checked in simulation for every case: observations and actions are the same on the rig. Returns
-    the clearance below which the beam is off, the file's or the scene's, mm.
+    the clearance below which the beam is off, mm: the larger of the file's and the scene's.
     """
     found, seen, clear_mm = settings(spec), set(), 0.0
     if spec.in_scene:

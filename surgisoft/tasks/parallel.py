@@ -12,7 +12,7 @@ from gymnasium.spaces import Box
 from gymnasium.spaces import Dict as DictSpace
 from pettingzoo import ParallelEnv
 
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, unknown_name
 from surgisoft.tasks.base import LoneEpisode, Task, TaskState
 from surgisoft.tasks.numpy_adapter import (
     RGB_ARRAY,
@@ -105,9 +105,7 @@ class SurgicalEnv(ParallelEnv):
             raise InputError(f"no action for {', '.join(absent)}: expected one for each live agent")
         unknown = [agent for agent in actions if agent not in self.possible_agents]
         if unknown:
-            raise InputError(
-                f"action for '{unknown[0]}', expected agents {', '.join(self.possible_agents)}"
-            )
+            raise unknown_name("agent", unknown[0], self.possible_agents)
         if self.lone is not None:
             return self._lone_step(self.lone, actions)
         held = {agent: np.asarray(actions[agent])[None] for agent in self.agents}

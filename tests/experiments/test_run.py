@@ -315,3 +315,6 @@ def test_the_rule_of_success_says_which_of_its_values_vary(tmp_path):
     vary = '\n[[vary]]\nfield = "task.fire_mm"\nvalues = [0.5, 5.0]\n'
     varied = load_experiment(write(tmp_path, TINY + vary))
     assert "(fire_mm: the setting's value); " in rules(SimpleNamespace(experiment=varied))
+    other = vary.replace("task.fire_mm", "task.world.randomisation.mount_mm")
+    drawn = load_experiment(write(tmp_path, TINY + other))
+    assert "setting's value" not in rules(SimpleNamespace(experiment=drawn)), "not in the rule"

@@ -203,7 +203,7 @@ def test_wrong_use_is_one_line():
     env.reset()
     with pytest.raises(InputError, match="no action for arm"):
         env.step({"laser": np.zeros(3)})
-    with pytest.raises(InputError, match="action for 'laser', expected agents arm"):
+    with pytest.raises(InputError, match="unknown agent 'laser': known are arm"):
         env.step({"arm": np.zeros(3), "laser": np.zeros(3)})
     with pytest.raises(InputError, match=r"shape \(1, 2\), expected \(1, 3\)"):
         env.step({"arm": np.zeros(2)})

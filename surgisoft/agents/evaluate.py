@@ -35,6 +35,8 @@ RATES = ("success", "collided", "failed")
 """Numbers of an episode that are 0 or 1: their mean is a rate."""
 SHARES = ("completion", "view_fraction", "in_view", "visited")
 """Numbers of an episode from 0 to 1: an interval of their mean ends there."""
+SIZES = ("_gap_mm", "_mm2", "_s")
+"""Ends of the names of numbers that are never negative, besides errors: gaps, areas and times."""
 
 
 @dataclass(frozen=True)
@@ -193,7 +195,7 @@ def _in_view(task: Task, result: Rollout) -> Tensor:
 def summary(name: str, values: np.ndarray) -> Summary:
     """Mean of (N,) numbers of that name with its interval.
 
-    Wilson's (1927) for a rate, else Student's (1908), which ends at 0 and 1 for a share.
+    Wilson's (1927) for a rate, else Student's (1908), within the values that the number can have.
     """
     known = values[np.isfinite(values)]
     if not len(known):
@@ -201,11 +203,16 @@ def summary(name: str, values: np.ndarray) -> Summary:
     if name in RATES:
         low, high = wilson(round(known.sum()), len(known))
     else:
-        low, high = student(known)
-        if name in SHARES:
-            low, high = max(low, 0.0), min(high, 1.0)
+        low, high = np.clip(student(known), *_range(name))
     ends = (float(known.min()), float(known.max()))
     return Summary(float(known.mean()), float(low), float(high), *ends, len(known))
+
+
+def _range(name: str) -> tuple[float, float]:
+    """Least and largest value that a number of that name can have."""
+    if name in SHARES:
+        return 0.0, 1.0
+    return 0.0 if "error" in name or name.endswith(SIZES) else -math.inf, math.inf
 
 
 def wilson(hits: int, count: int) -> tuple[float, float]:

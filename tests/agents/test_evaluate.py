@@ -59,10 +59,16 @@ def test_interval_of_a_mean_holds_it_as_often_as_it_says(episodes):
     assert 0.93 <= np.mean(inside) <= 0.97
 
 
-def test_the_interval_of_a_share_ends_at_one():
-    found = summary("completion", np.array([1.0, 1.0, 0.9]))
-    assert found.low < 0.9
-    assert found.high == 1.0
+def test_an_interval_stays_within_what_the_number_can_be():
+    """Two numbers: 12.7 standard errors to either side. A clearance may be negative."""
+    share = summary("completion", np.array([1.0, 1.0, 0.9]))
+    assert share.low < 0.9
+    assert share.high == 1.0
+    values = np.array([0.1, 0.3])
+    for name in ("error_max_mm", "time_s", "healthy_mm2", "largest_gap_mm"):
+        assert summary(name, values).low == 0.0
+        assert summary(name, values).high == pytest.approx(0.2 + 12.706 * 0.1, abs=1e-3)
+    assert summary("clearance_mm", values).low == pytest.approx(0.2 - 12.706 * 0.1, abs=1e-3)
 
 
 def test_one_episode_has_no_interval():

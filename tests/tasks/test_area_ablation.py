@@ -56,6 +56,32 @@ def test_healthy_tissue_beyond_the_margin_counts_against_it():
     torch.testing.assert_close(terms["treated"], outcome.measures["completion"])
 
 
+def test_success_by_hand():
+    """98 % of the area and at most 5 mm^2 of healthy tissue; the margin between counts for
+    neither."""
+    task = AreaAblation(SPOT)
+    state = Episodes(task).seeded(0, 4)
+    zone_mm2 = torch.tensor([[0.981, 9.0, 4.9], [0.979, 9.0, 0.0], [0.981, 0.0, 5.1], [1.0, 0, 0]])
+    zone_mm2[:, 0] *= task.area_mm2
+    scene = state.world.scene
+    low = scene.clearance.bodies_mm.clone()
+    low[3] = -0.1
+    scene = replace(
+        scene,
+        dose=replace(scene.dose, zone_mm2=zone_mm2),
+        clearance=replace(scene.clearance, bodies_mm=low),
+    )
+    state = replace(state, world=replace(state.world, scene=scene))
+    found = task.measures(state)
+    assert found["success"].tolist() == [1.0, 0.0, 0.0, 0.0]
+    assert task.ended(state).tolist() == [True, False, True, True]
+    torch.testing.assert_close(found["completion"], torch.tensor([0.981, 0.979, 0.981, 1.0]))
+    torch.testing.assert_close(found["healthy_mm2"], torch.tensor([4.9, 0.0, 5.1, 0.0]))
+    terms = task.rewards(state)["laser"]
+    torch.testing.assert_close(terms["healthy"], torch.tensor([-0.49, 0.0, -0.51, 0.0]))
+    torch.testing.assert_close(terms["treated"], found["completion"])
+
+
 def test_what_does_not_fit_is_one_line():
     with pytest.raises(InputError, match=r"a dose of 0\.1 J/mm2 ablates nothing"):
         AreaAblation(replace(SPOT, dose_j_per_mm2=0.1))

@@ -95,6 +95,27 @@ def test_the_endoscope_has_to_move_along(task, cut):
     assert (state.goal.point() >= task.scene.stretches[0].count).all(), "it waits there"
 
 
+def test_the_seam_of_a_closed_contour_is_cut_over_2_mm():
+    """A circle of 5 mm with a margin of 1 mm, in steps of 0.25 mm: eight points come again."""
+    circle = ContourSpec("circle", centre_mm=(-37.093, -23.9786, 75.7208), diameter_mm=5.0)
+    task = ContourAblation(ContourAblationConfig(contours=(circle,), margin_mm=1.0))
+    route = Episodes(task).seeded(0, 3).goal.route
+    (stretch,) = task.scene.stretches
+    assert stretch.count == pytest.approx(7.0 * np.pi / 0.25, rel=0.03)
+    assert route.shape == (3, stretch.count + 8)
+    assert torch.equal(route[:, :8], route[:, -8:])
+    assert all(len(set(row[8:])) == stretch.count for row in route.tolist())
+
+
+def test_burnt_areas_are_told_by_their_zones(task):
+    """1 mm^2 burnt inside, 2 mm^2 beside the path, 3 mm^2 beyond."""
+    state = Episodes(task).seeded(0, 1)
+    dose = replace(state.world.scene.dose, zone_mm2=torch.tensor([[1.0, 2.0, 3.0]]))
+    scene = replace(state.world.scene, dose=dose)
+    found = task.measures(replace(state, world=replace(state.world, scene=scene)))
+    assert (found["inside_mm2"].item(), found["healthy_mm2"].item()) == (1.0, 3.0)
+
+
 def test_what_does_not_fit_is_one_line():
     with pytest.raises(InputError, match="take 2 s at 4 mm/s, and time_s is 1 s"):
         ContourAblation(ContourAblationConfig(contours=LINES, speed_mm_s=4.0, time_s=1.0))

@@ -17,8 +17,14 @@ from surgisoft.surrogate.networks import ConstantCurvature
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.inverse_kinematics import action_towards
 from surgisoft.tasks.keyhole import Keyhole, KeyholeConfig
-from surgisoft.tasks.trajectories.waypoints import point_at, progress
+from surgisoft.tasks.trajectories.waypoints import (
+    WaypointSequence,
+    point_at,
+    progress,
+    route_mm,
+)
 from surgisoft.tasks.world.arm import ModelArm
+from surgisoft.tasks.world.plate import Routes
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +112,60 @@ def test_a_target_is_counted_when_the_tip_is_near(task):
     assert task.rewards(on)["arm"]["visits"].tolist() == [6.0, 0.0]
 
 
+def test_a_target_counts_once_without_contact_and_as_measured_where_it_is(task, monkeypatch):
+    """The tip on its target in every episode, but for the last; the world stands still."""
+    monkeypatch.setattr(task.world, "step", lambda world, actions: world)
+    state = Episodes(task).seeded(0, 4)
+    arm, clearance = state.world.arms["arm"], state.world.scene.clearance
+    state = replace(state, goal=replace(state.goal, reached=torch.tensor([1, 0, 3, 0])))
+    points, low = arm.points_mm.clone(), clearance.bodies_mm.clone()
+    points[:, -1] = task.route_mm(state)[:, -1] + torch.tensor([0.9, 0.0, 0.0])
+    points[3, -1, 0] += 0.2
+    low[1] = -0.1
+    scene = replace(state.world.scene, clearance=replace(clearance, bodies_mm=low))
+    arms = {"arm": replace(arm, points_mm=points)}
+    there = replace(state, world=replace(state.world, arms=arms, scene=scene))
+    none = {"arm": torch.zeros(4, 3)}
+    nan = float("nan")
+    for measured, reached in (
+        (None, [2, 0, 3, 0]),
+        ([nan, nan, nan, nan], [2, 0, 3, 0]),
+        ([0.0, 1.0, 1.0, 1.0], [1, 0, 3, 1]),
+    ):
+        given = None if measured is None else torch.tensor(measured)
+        after = task.advance(there, none, given)
+        assert after.goal.reached.tolist() == reached
+        assert (
+            task.visited(there, after).tolist()
+            == (after.goal.reached - state.goal.reached).tolist()
+        )
+        assert torch.equal(task.visited(None, after), after.goal.reached)
+
+
+def test_the_rewards_of_the_way_by_hand(task):
+    """The tip on the first route, 10 mm and 1 mm of arc length before its end."""
+    state = Episodes(task).seeded(0, 2)
+    route, arm = task.route_mm(state), state.world.arms["arm"]
+    length = progress(route, route[:, -1]).along_mm
+    points = arm.points_mm.clone()
+    points[:, -1] = point_at(route, length - torch.tensor([10.0, 1.0]))
+    there = replace(state, world=replace(state.world, arms={"arm": replace(arm, points_mm=points)}))
+    terms = task.rewards(there)["arm"]
+    for name, scale in (("way", 20.0), ("near", 1.0)):
+        expected = [math.exp(-10.0 / scale), math.exp(-1.0 / scale)]
+        np.testing.assert_allclose(terms[name], expected, rtol=0.02)
+    np.testing.assert_allclose(task.measures(there)["left_mm"], [10.0, 1.0], atol=0.02)
+    low = replace(
+        there.world.scene.clearance,
+        bodies_mm=torch.full_like(there.world.scene.clearance.bodies_mm, 0.4),
+    )
+    near = replace(
+        there, world=replace(there.world, scene=replace(there.world.scene, clearance=low))
+    )
+    assert task.rewards(near)["arm"]["contact"].tolist() == [-1.0, -1.0], "within limit_mm"
+    assert task.measures(near)["collided"].tolist() == [0.0, 0.0]
+
+
 def test_contact_ends_the_episode_and_is_no_success(task):
     state = Episodes(task).seeded(0, 2)
     clearance = state.world.scene.clearance
@@ -116,6 +176,9 @@ def test_contact_ends_the_episode_and_is_no_success(task):
     hit = replace(state, goal=goal, world=replace(state.world, scene=scene))
     assert task.ended(hit).tolist() == [True, False]
     assert task.measures(hit)["success"].tolist() == [0.0, 1.0]
+    fewer = replace(hit, goal=replace(goal, reached=torch.tensor([2, 2])))
+    assert task.measures(fewer)["success"].tolist() == [0.0, 0.0]
+    np.testing.assert_allclose(task.measures(fewer)["visited"], 2.0 / 3.0)
     assert task.rewards(hit)["arm"]["contact"].tolist() == [-1.0, 0.0]
 
 
@@ -129,6 +192,44 @@ def test_progress_along_a_bend_by_hand():
     there = point_at(line, torch.tensor([0.0, 4.0, 13.0, 99.0]))
     expected = [[0, 0, 0], [4, 0, 0], [10, 3, 0], [10, 5, 0]]
     np.testing.assert_allclose(there, expected, atol=1e-5)
+
+
+def test_of_a_way_there_and_back_the_later_place_counts():
+    line = torch.tensor([[[0.0, 0, 0], [10, 0, 0], [0, 0, 0]]])
+    found = progress(line, torch.tensor([[4.0, 0.5, 0.0]]))
+    np.testing.assert_allclose(found.along_mm, [16.0], atol=1e-5)
+    np.testing.assert_allclose(found.remaining_mm, [4.5], atol=1e-5)
+
+
+def test_a_route_leads_back_to_the_centre_and_on_to_the_next_target_by_hand():
+    """Three routes from rest at 0 to 10, 20 and 30 mm; two of them are visited."""
+    along = torch.tensor([[0.0, 10.0], [0.0, 20.0], [0.0, 30.0]])
+    routes = Routes(along[..., None] * torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0, 1, 2, 3]))
+    order = torch.tensor([[1, 2]]).expand(3, 2)
+    found = route_mm(routes, WaypointSequence(order, torch.tensor([0, 1, 2])))
+    assert found[..., 0].tolist() == [[0.0, 0.0, 20.0], [20.0, 0.0, 30.0], [20.0, 0.0, 30.0]]
+
+
+def test_observations_by_hand(task):
+    """Measured key points 0.5 mm off the true ones; 4 mm of clearance, one of three visits."""
+    state = Episodes(task).seeded(0, 1)
+    arm, scene = state.world.arms["arm"], state.world.scene
+    seen = arm.points_mm + torch.tensor([0.5, 0.0, 0.0])
+    low = torch.full_like(scene.clearance.bodies_mm, 4.0)
+    scene = replace(scene, clearance=replace(scene.clearance, bodies_mm=low))
+    world = replace(state.world, arms={"arm": replace(arm, seen_mm=seen)}, scene=scene)
+    goal = replace(state.goal, reached=torch.tensor([1]))
+    state = replace(state, world=replace(world, steps=torch.tensor([60])), goal=goal)
+    found = {block.name: value[0].tolist() for block, value in task.blocks(state)["arm"].items()}
+    tip, route = seen[0, -1], task.route_mm(state)
+    assert found["target"] == pytest.approx((route[0, -1] - tip).asinh().tolist())
+    # A stride is what the pumps' step moves the tip by at most: 4 mm in three steps of 1 kPa.
+    stride = 4.0 / 3.0 * task.arm.pneumatics.step_kPa
+    onward = point_at(route, progress(route, tip[None]).along_mm + stride)[0]
+    assert found["onward"] == pytest.approx((onward - tip).asinh().tolist())
+    assert found["clearance"] == pytest.approx([0.4])
+    assert found["visits"] == pytest.approx([1.0 / 3.0])
+    assert found["time"] == pytest.approx([60.0 / 300.0])
 
 
 @pytest.mark.parametrize(

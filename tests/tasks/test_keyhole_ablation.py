@@ -109,6 +109,32 @@ def test_time_at_the_rim_is_counted_and_decides(quick, cut):
     wide = KeyholeAblation(replace(quick.config, rim_mm=5.0))
     after = wide.advance(state, still)
     assert (after.goal.at_rim - state.goal.at_rim).tolist() == [1, 1]
+    # One body is enough: the limit lies between the distances of the two from the wall.
+    both = torch.stack([*quick.rims_mm(quick.advance(state, still)).values()])
+    assert (both.amin(0) < both.amax(0) - 0.01).all()
+    between = replace(quick.config, rim_mm=both.mean(0)[0].item())
+    after = KeyholeAblation(between).advance(state, still)
+    assert (after.goal.at_rim - state.goal.at_rim)[0] == 1
+
+
+def test_the_place_in_the_port_is_rewarded_while_the_arms_enter(quick, cut):
+    """A tip 3 mm across and 60 mm along its port's axis; 1 for both once the arms are in."""
+    state, arms = cut[0][-1], {}
+    for name, part in cut[0][-1].world.arms.items():
+        pose, points = quick.world.arms[name].pose, part.points_mm.clone()
+        across = 3.0 * pose[:3, 0] if name == "laser" else 0.0
+        points[:, -1] = pose[:3, 3] + 60.0 * pose[:3, 2] + across
+        arms[name] = replace(part, points_mm=points, seen_mm=points + 0.5 * pose[:3, 1])
+    out = torch.tensor([40.0, 0.0])
+    there = replace(state, world=replace(state.world, arms=arms, out_mm=out))
+    terms, weights = quick.rewards(there), quick.weights
+    for name, centred in (("laser", np.exp(-3.0 / quick.config.centred_mm)), ("endoscope", 1.0)):
+        found = terms[name]["centred"] / weights[name].centred
+        np.testing.assert_allclose(found, [centred, 1.0], rtol=1e-4)
+        seen = {block.name: value for block, value in quick.blocks(there)[name].items()}
+        np.testing.assert_allclose(seen["out"][:, 0], [0.8, 0.0], atol=1e-6)
+        off = seen["centred"].sinh().norm(dim=1)
+        np.testing.assert_allclose(off, np.hypot(3.0 * (name == "laser"), 0.5), rtol=1e-3)
 
 
 def test_a_bent_arm_meets_the_rim_on_its_way_in(quick):

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from surgisoft.scene.folder import open_scene
-from surgisoft.scene.spec import PHANTOM
+from surgisoft.scene.spec import PHANTOM, ContourSpec
 from surgisoft.tasks.world.arm import Randomisation
 from surgisoft.tasks.world.scene import NOT_RANDOMISED
-from surgisoft.tasks.world.treatment import rings, treatment_of, windows
+from surgisoft.tasks.world.treatment import outlines, rings, treatment_of, windows
 
 BAND_MM, POINTS = 2.0, 24
+SPOT_MM = (-37.093, -23.9786, 75.7208)
+"""A place on the phantom's liver."""
 
 
 ASKED = []
@@ -109,3 +111,22 @@ def test_the_window_around_a_point_ends_with_an_open_path_and_goes_round_a_close
         assert seen[0, :, 0].tolist() == first
         assert seen[5, :, 0].tolist() == [3, 4, 5, 6, 7]
         np.testing.assert_array_equal(normals, -seen)
+
+
+def test_a_closed_path_shorter_than_the_window_is_seen_once():
+    """Ten points around 10 mm, and 8 mm on either side: 5 mm are half of the way round."""
+    points = np.arange(10)[:, None] * np.ones(3)
+    path = SimpleNamespace(points_mm=points, normals=-points, length_mm=10.0, closed=True)
+    assert windows(path, 8.0, 3)[0][0, :, 0].tolist() == [5, 0, 5]
+
+
+def test_a_tasks_margin_is_added_to_that_of_each_closed_contour():
+    """A circle of 5 mm with a margin of 1 mm, by 2 mm more: 11 mm across; an open line stays."""
+    scene = open_scene(PHANTOM)
+    circle = ContourSpec("circle", centre_mm=SPOT_MM, diameter_mm=5.0, margin_mm=1.0)
+    line = ContourSpec("line", ((-51.0, -21.4, 73.7), (-48.2, -21.7, 74.2)), closed=False)
+    grown, same = outlines(scene, (circle, line), 2.0, 0.25)
+    assert grown.length_mm == pytest.approx(11.0 * np.pi, rel=0.03)
+    at_once, plain = outlines(scene, (replace(circle, margin_mm=3.0), line), 0.0, 0.25)
+    np.testing.assert_allclose(grown.points_mm, at_once.points_mm)
+    np.testing.assert_array_equal(same.points_mm, plain.points_mm)

@@ -475,6 +475,58 @@ def test_the_weights_in_force_have_the_signs_of_their_features():
             assert weight * feature.sign >= 0.0, (name, feature.name)
 
 
+@pytest.mark.parametrize(("z", "counts"), [(0.8, False), (0.9, True)])
+def test_two_effects_count_only_where_the_second_is_beyond_chance(z, counts):
+    """A p-value of 0.2 is the quantile 0.84. The two leave 0.1 of 0.5 that one effect leaves."""
+    one = replace(ALONE, gain=0.5, left_size=2.0, form_z=0.6, left_log_free=0.4)
+    two = replace(PAIR, gain=0.9, left_size=0.8, form_z=1.5, left_log_free=0.1, last_z=z)
+    evidence = replace(GOOD, proposals=(one, two), line=0.5, free_log_gain=9.0)
+    said = {}
+    for model in ("missing", "known"):
+        names = [f"{model} {feature.name}" for feature in FEATURES[model]]
+        said |= dict(zip(names, features_of(model, evidence), strict=True))
+    gain, left = (0.9, 0.8) if counts else (0.5, 2.0)
+    assert said["missing explained"] == pytest.approx(gain)
+    assert said["missing of_box"] == pytest.approx(gain / 0.9)
+    assert said["missing stays"] == pytest.approx(math.log(left / 3.0))
+    assert said["known explained"] == pytest.approx(-0.5 * math.log(1.0 - gain + 0.02))
+    assert said["known left_size"] == pytest.approx(math.log(left))
+    assert said["known form_z"] == pytest.approx(0.5 if counts else 0.2)
+
+
+def test_features_by_hand():
+    """What is 0 or at a bound in other tests: sizes of what is left, and the two in one's place."""
+    exact = replace(CREEP, exact_form=True)
+    left = replace(ALONE, left_size=2.0)
+    pair = replace(
+        PAIR_WITH_LAG, gain=0.97, left_size=1.8, last_z=1.2, last_log_gain=0.5,
+        own_gain=0.4, own_log_gain=0.3, instead_margin=(1.5, 4.5), instead_left=(0.6, 0.2),
+    )  # fmt: skip
+    evidence = replace(GOOD, effects=(exact, LAG), proposals=(left, pair), free_box=0.6)
+    known, two, missing = (
+        {f.name: v for f, v in zip(FEATURES[name], features_of(name, evidence), strict=True)}
+        for name in ("known", "two", "missing")
+    )
+    assert known["exact_left"] == pytest.approx(math.log(1.8))
+    assert known["left_size"] == pytest.approx(math.log(1.8))
+    assert missing["of_box"] == pytest.approx(1.0), "never more than all"
+    beyond = 0.05 / (0.05 + 0.02)
+    assert two["last_z"] == pytest.approx(0.4)
+    assert two["last_log_gain"] == pytest.approx(0.5 * beyond)
+    assert two["own_gain"] == pytest.approx(0.4 * beyond)
+    assert two["own_log_gain"] == pytest.approx(0.3 * beyond)
+    assert two["better"] == pytest.approx(math.log(0.07 / 0.05))
+    assert two["instead_margin"] == pytest.approx(0.5), "the lesser of both"
+    assert two["instead_left"] == pytest.approx(math.log((0.03 * math.exp(0.2) + 0.02) / 0.05))
+    plain = replace(evidence, effects=(CREEP, LAG))
+    place = [feature.name for feature in FEATURES["known"]].index("exact_left")
+    assert features_of("known", plain)[place] == 0.0
+    place = [feature.name for feature in FEATURES["first"]].index("exact_left")
+    lag = replace(LAG, exact_form=True, gain=0.5, left=0.4)
+    rows = features_of("first", replace(evidence, effects=(CREEP, lag)))
+    assert rows[:, place] == pytest.approx([0.0, 0.5 * (math.log(2.5) + 0.2)])
+
+
 def test_features_are_finite_of_order_one():
     for evidence in (GOOD, QUIET, replace(GOOD, effects=(), proposals=())):
         for name in FEATURES:

@@ -22,7 +22,7 @@ from surgisoft.diagnosis.diagnose import (
 )
 from surgisoft.diagnosis.inputs import identification_problem
 from surgisoft.diagnosis.residuals import Floor, held_out_rows, residual_table
-from surgisoft.diagnosis.testability import DETECTED
+from surgisoft.diagnosis.testability import DETECTED, cubics
 from surgisoft.diagnosis.testability import testable as split_by_testability
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import save_recording
@@ -341,6 +341,44 @@ def test_an_effect_that_shows_below_its_plausible_range_is_a_candidate():
     kept, absent = split_by_testability(replace(problem, table=table), some, ["contact"])
     assert not kept
     assert [each.cause for each in absent] == ["below_noise"]
+
+
+def test_a_loop_that_is_a_function_of_the_actuation_cannot_show():
+    """Friction whose change is a cubic of the actuation, up to a share of its power of its own."""
+    rig = VirtualRig(0, take=7)
+    recording = rig.record(make_protocol("mixed", rig.limits, 600, seed=2))[0]
+    problem = identification_problem(default_arm(), [recording])
+    one = candidates(problem, ["hysteresis"])[0]
+    basis = cubics(problem.pressure)
+    cubic = basis[:, 1:] @ np.linspace(1.0, 2.0, basis.shape[1] - 1)
+    other = np.random.default_rng(0).normal(size=len(cubic))
+    other -= basis @ (basis.T @ other)
+    cubic, other = cubic / np.linalg.norm(cubic), other / np.linalg.norm(other)
+    for own, causes in ((0.03, ["no_reversals"]), (0.07, [])):
+        column = np.sqrt(1.0 - own) * cubic + np.sqrt(own) * other
+        shape = one.sensitivities.shape
+        alike = replace(one, sensitivities=np.broadcast_to(column[:, None, None, None], shape))
+        _, absent = split_by_testability(problem, [alike], ["hysteresis"])
+        assert [each.cause for each in absent] == causes
+
+
+def test_an_effect_has_to_stand_out_from_the_noise_of_the_mean_of_all_motions():
+    """The largest plausible load changes a key point by so many mm RMS: 3 standard errors are
+    three times the noise over the root of the number of blocks."""
+    rig = VirtualRig(0, take=7)
+    recording = rig.record(make_protocol("mixed", rig.limits, 600, seed=2))[0]
+    problem = identification_problem(default_arm(), [recording])
+    one = candidates(problem, ["payload"])[0]
+    along = np.sqrt(np.square(one.sensitivities).sum(2).mean((0, 1)))
+    unit = np.eye(len(along))[along.argmax()]
+    quantities = {each.name: each for each in one.with_amplitudes(unit).quantities()}
+    sag = quantities["sag_mm"]
+    most_mm = along.max() * sag.high / abs(sag.value)
+    noise_mm = np.sqrt(len(problem.motion)) * most_mm / 3.0
+    for share, causes in ((0.95, []), (1.05, ["below_noise"])):
+        table = replace(problem.table, noise_mm=np.full(5, share * noise_mm))
+        _, absent = split_by_testability(replace(problem, table=table), [one], ["payload"])
+        assert [each.cause for each in absent] == causes
 
 
 def test_all_shares_of_a_diagnosis_are_between_0_and_1(found):

@@ -24,12 +24,16 @@ from surgisoft.diagnosis.known_error import known_error
 from surgisoft.diagnosis.pages import diagnosis as page
 from surgisoft.diagnosis.pairs import (
     LEAST_ROWS,
+    RepeatedShare,
     RunSignal,
     before_and_after,
+    free_motion,
     matches,
     paired_discrepancy,
+    repeated_share,
     rms_by_point,
     slope_error,
+    without_noise,
 )
 from surgisoft.diagnosis.residuals import LEAST_DISCREPANCY, model_discrepancy, residual_table
 from surgisoft.errors import InputError
@@ -40,7 +44,7 @@ from surgisoft.report import charts
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, save_model
 from surgisoft.surrogate.model import Validation
-from tests.diagnosis.synthetic import NOISE_MM, PERIOD_S, recording, still_model, walk
+from tests.diagnosis.synthetic import NOISE_MM, PERIOD_S, POINTS, recording, still_model, walk
 
 ROWS = 2400
 SMOOTHNESS = 25
@@ -365,6 +369,154 @@ def test_the_systematic_error_of_a_pair_by_hand():
     np.testing.assert_allclose(found, [np.sqrt(0.18), np.sqrt(0.32 + 0.04)])
     quiet = paired_discrepancy(np.zeros(2), correction, np.array([1.0, 2.0]), 0.0)
     np.testing.assert_allclose(quiet, LEAST_DISCREPANCY * np.array([1.0, 2.0]))
+
+
+def white(rows, *seeds):
+    """(rows, n, 3) sums of white noise by seed, about the key points at rest."""
+    shape = rows, *POINTS.shape
+    return POINTS + sum(np.random.default_rng(seed).normal(0, 1.0, shape) for seed in seeds)
+
+
+def table_of(model, key_points_mm):
+    rows = len(key_points_mm)
+    still = recording(np.zeros(rows), walk(rows))
+    return residual_table(model, [replace(still, key_points_mm=key_points_mm)])
+
+
+def test_motion_is_repeated_by_the_root_of_its_coherence(model):
+    """Half of the power of both is common: share 0.5 (coherence 1/4). A filtered motion: 1."""
+    rows = 6000
+    after = table_of(model, white(rows, 1, 2))
+    fast = slice(2, None)
+    half = repeated_share(after, white(rows, 1, 3))
+    assert half.share[fast].mean() == pytest.approx(0.5, abs=0.03)
+    np.testing.assert_array_equal(half.share[:2], 1.0)
+    np.testing.assert_allclose(half.frequency_Hz[:3], [0.0, 0.3125, 0.625])
+    assert repeated_share(after, 0.5 * white(rows, 1, 2)).share.min() > 1.0 - 1e-6
+    np.testing.assert_allclose(half.at(np.array([0.0, 0.3])), 1.0)
+
+
+def test_few_stretches_of_what_is_not_repeated_show_no_coherence_by_chance(model):
+    """Of 8 stretches of noise the plain estimate finds a squared coherence of 1/8 or more.
+
+    The held-out quarter, which is large and the same in both here, is not looked at. Of 3 stretches
+    none of the fast motion counts.
+    """
+    rows = 200
+    after, before = white(rows, 1), white(rows, 2)
+    before[150:] = after[150:] = POINTS + 10.0 * (after[150:] - POINTS)
+    found = repeated_share(table_of(model, after), before)
+    assert len(found.frequency_Hz) == 17
+    assert np.mean(found.share[2:] ** 2) < 0.06
+    few = repeated_share(table_of(model, white(80, 1)), white(80, 1))
+    np.testing.assert_array_equal(few.at(np.array([0.0, 0.2, 0.4])), 1.0)
+    np.testing.assert_array_equal(few.at(np.array([0.41, 1.0, 5.0])), 0.0)
+
+
+def test_a_motion_is_taken_as_far_as_it_is_repeated(model):
+    """Two cosines with a whole number of half waves in the run: one stays, one is halved."""
+    half = RepeatedShare(np.array([0.0, 1.0, 2.0]), np.array([[1.0], [1.0], [0.5]]))
+    t = (np.arange(200) + 0.5) * 0.05
+    slow, fast = np.cos(2 * np.pi * 0.5 * t), np.cos(2 * np.pi * 3.0 * t)
+    motion = (2.0 + slow + fast)[:, None, None] * np.ones((1, 1, 3))
+    expected = (2.0 + slow + 0.5 * fast)[:, None, None] * np.ones((1, 1, 3))
+    np.testing.assert_allclose(half.of(motion, 0.05), expected, atol=1e-9)
+    # A ramp ends where it ends, and not where it began.
+    ramp = np.linspace(0.0, 10.0, 200)[:, None, None] * np.ones((1, 1, 3))
+    assert abs(half.of(ramp, 0.05)[-1] - 10.0).max() < 0.2
+
+
+def test_motion_is_free_where_either_recording_has_more_than_the_model_predicts(model):
+    """A swing of 1 mm at 2 Hz in one of both, of which nothing comes again, over the model's own.
+
+    Its power is 100 times the predicted one, or 3 times, which a change of the arm may make of it.
+    """
+    rows, t_s = 1600, 0.1 * np.arange(1600)
+    swing = np.zeros((rows, 3, 3))
+    swing[:, -1, 0] = np.sin(2.0 * np.pi * 2.0 * t_s)
+    apart = RepeatedShare(np.array([0.0, 5.0]), np.zeros((2, 3)))
+    for of_predicted, free in ((0.1, np.sqrt(0.5)), (1.0 / np.sqrt(3.0), 0.0)):
+        predicted = POINTS + of_predicted * swing
+        table = replace(table_of(model, POINTS + swing), predicted_mm=predicted)
+        before = table_of(model, predicted)
+        found = free_motion(table, before.measured_mm, predicted, swing, apart)
+        assert found == pytest.approx([0.0, 0.0, free], abs=0.02)
+        quiet = replace(table_of(model, predicted), predicted_mm=predicted)
+        found = free_motion(quiet, POINTS + swing, predicted, swing, apart)
+        assert found == pytest.approx([0.0, 0.0, free], abs=0.02)
+        again = replace(apart, share=np.ones((2, 3)))
+        assert free_motion(quiet, POINTS + swing, predicted, swing, again) == pytest.approx(0.0)
+
+
+def test_the_fast_part_of_a_correction_counts_as_far_as_the_arm_followed_it(model):
+    """Half of it: then half of what differs from the mean over 2 s is taken off."""
+    rows, rng = 1200, np.random.default_rng(0)
+    table = table_of(model, white(rows, 1))
+    slow = np.sin(2.0 * np.pi * np.arange(rows) / 1200.0)[:, None, None] * np.ones((1, 3, 3))
+    fast = rng.normal(0, 1.0, (rows, 3, 3))
+    followed = slow + 0.5 * fast + rng.normal(0, 0.2, fast.shape)
+    found = without_noise(table, followed, slow + fast)
+    mean = np.stack([np.convolve(x, np.ones(21) / 21, "same") for x in fast.reshape(rows, -1).T], 1)
+    inner = slice(20, -20)
+    expected = (slow + 0.5 * (fast + mean.reshape(fast.shape)))[inner]
+    assert np.sqrt(np.mean((found[inner] - expected) ** 2)) < 0.05
+    still = without_noise(table, slow, slow + fast)
+    assert np.std((still - slow)[inner]) < 0.25, "noise of the sensors moves no arm"
+
+
+def test_a_final_check_needs_partners_of_half_of_the_held_out_rows(model):
+    """40 % of them, 240 rows, have one; where pairs are asked for, as many as a fit takes do."""
+    motion, other, end = smooth_walk(3), smooth_walk(11), 0.85 * ROWS * PERIOD_S
+
+    def turning_off(t_s):
+        return np.where((t_s < end)[:, None], motion(t_s), other(t_s))
+
+    table = residual_table(model, [made(turning_off, 0.0)])
+    before = [made(motion, 0.0, seed=2, name="earlier")]
+    both = before_and_after(table, before)
+    assert both.used
+    assert 0.35 < both.pairs.paired[table.held_out].mean() < 0.45
+    checked = both.with_final_check()
+    assert (checked.used, checked.unchecked) == (False, True)
+    assert before_and_after(table, before, "always").with_final_check().used
+
+
+def test_held_out_rows_do_not_make_pairs_enough(model):
+    """40 % of the training rows have a partner, and all of the held-out ones: 55 % of all rows."""
+    motion, other, begin = smooth_walk(3), smooth_walk(11), 0.45 * ROWS * PERIOD_S
+
+    def turning_on(t_s):
+        return np.where((t_s < begin)[:, None], other(t_s), motion(t_s))
+
+    table = residual_table(model, [made(turning_on, 0.0)])
+    both = before_and_after(table, [made(motion, 0.0, seed=2, name="earlier")])
+    assert both.pairs.paired.mean() > 0.5
+    assert 0.3 < both.pairs.paired[~table.held_out].mean() < 0.45
+    assert not both.used
+
+
+def test_a_minute_of_pairs_is_a_minute_and_not_sixty_rows(model):
+    """Half a minute of one of three recordings repeats BEFORE: 300 rows, of which 225 train."""
+    motion, rows = smooth_walk(3), round(30.0 / PERIOD_S)
+    before = made(motion, 0.0, rows=rows, seed=9, name="earlier")
+    after = [made(smooth_walk(10 + k), 0.0, rows=rows, seed=k, name=f"new{k}") for k in (1, 2)]
+    table = residual_table(model, [made(motion, 0.0, rows=rows), *after])
+    paired_rows = before_and_after(table, [before]).pairs.paired[~table.held_out].sum()
+    assert 160 <= paired_rows <= 225
+    with pytest.raises(InputError, match="expected half of them, or 60 s"):
+        before_and_after(table, [before], "always")
+
+
+def test_the_mismatch_of_a_change_is_a_mean_over_rows(model):
+    """A long recording repeats BEFORE exactly, a short one with another sensor's noise."""
+    motion = smooth_walk(3)
+    noisy = made(motion, 0.0, rows=400, seed=4, actuation_noise=0.05, name="noisy")
+    table = residual_table(model, [made(motion, 0.0), noisy])
+    change = before_and_after(table, [made(motion, 0.0, seed=2, name="earlier")]).change
+    rows, mismatch = np.array([(each.rows, each.mismatch) for each in change.stretches]).T
+    assert len(rows) == 2
+    assert change.mismatch == pytest.approx(np.sqrt((rows @ mismatch**2) / rows.sum()))
+    assert change.mismatch < 0.7 * np.sqrt(np.mean(mismatch**2))
 
 
 def test_a_run_at_rest_is_paired_beside_those_that_move(model):

@@ -4,6 +4,7 @@ import copy
 import json
 from dataclasses import asdict, replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,22 +29,26 @@ from surgisoft.diagnosis.diagnose import (
 from surgisoft.diagnosis.estimation.intervals import Parameter
 from surgisoft.diagnosis.inputs import identification_problem
 from surgisoft.diagnosis.refit import (
+    ASKED,
     Job,
     JointFit,
+    Outcome,
     RefitConfig,
     Split,
     apart_mm,
     fit_together,
     in_front,
+    least_units,
     reason_to_refit,
     refit,
     run_job,
 )
+from surgisoft.diagnosis.residuals import TOGETHER
 from surgisoft.errors import InputError
 from surgisoft.measurement.fitting import fit
 from surgisoft.measurement.recordings import Recording, save_recording
 from surgisoft.surrogate.checkpoint import save_model
-from surgisoft.surrogate.effects import make_effect
+from surgisoft.surrogate.effects import Memoryless, known_effects, make_effect
 from surgisoft.surrogate.model import ArmModel, Validation
 
 PERIOD_S, LAG_S, NOISE_MM = 0.1, 0.4, 0.1
@@ -212,6 +217,193 @@ def test_the_error_of_the_candidate_is_that_of_left_out_blocks(found):
         assert row.heldout_rmse_mm == pytest.approx(together, rel=0.1)
         assert row.difference_mm == pytest.approx(row.rival_mm - row.heldout_rmse_mm)
         assert row.ci95_mm[0] <= row.difference_mm <= row.ci95_mm[1]
+
+
+def with_errors(monkeypatch, given, implausible=()):
+    """Let trainings end with errors (B,) mm of each key point in the blocks of their left-out part,
+    by effect (None: the network alone), and with none in the others; returns the jobs.
+
+    implausible: (effect, part) of trainings that end with an implausible effect.
+    """
+    jobs = []
+
+    def run(split, job):
+        jobs.append(job)
+        label = job.effects[0] if job.effects else None
+        error = given[label] * np.ones(len(split.part))
+        error = np.where(split.part == job.part, error, 0.0)
+        rows = np.bincount(split.problem.block)
+        model = job.model
+        if (label, job.part) in implausible:
+            model = copy.deepcopy(model)
+            with torch.no_grad():
+                for amplitude in model.effects[label].amplitudes().values():
+                    amplitude.fill_(50.0)
+        losses = (rows * error**2)[:, None] * np.ones((1, 2))
+        return Outcome(model, losses, (*job.before, job.epochs))
+
+    monkeypatch.setattr(refitting, "run_job", run)
+    return jobs
+
+
+def only(*effects):
+    """What is left out so that these effects alone are tried."""
+    every = ("line_lag", "softening", "hysteresis", "creep", "rate_dependence", "inertia")
+    return [name for name in every if name not in effects]
+
+
+def test_the_score_of_a_candidate_by_hand(problem, monkeypatch):
+    """2 mm of the network alone and 1 mm with creep in every one of 20 blocks, of which half were
+    left out by each of two trainings; the noise counts beside both."""
+    jobs = with_errors(monkeypatch, {None: 2.0, "creep": 1.0})
+    found = refit(problem, without=only("creep"), config=SHORT)
+    (row,) = found.candidates
+    noise = problem.floor_mm**2
+    assert (found.unit, found.units) == ("blocks of time", 20)
+    assert (row.rival_mm, row.heldout_rmse_mm, row.difference_mm) == pytest.approx((2.0, 1.0, 1.0))
+    assert row.ci95_mm == pytest.approx((1.0, 1.0))
+    assert row.per_key_point_mm == pytest.approx((1.0, 1.0))
+    assert row.seeds_mm == pytest.approx((1.0, 1.0))
+    assert row.spread_mm == pytest.approx(0.0)
+    assert row.gain == pytest.approx(3.0 / (4.0 - noise))
+    assert row.log_gain == pytest.approx(np.log((4.0 + noise) / (1.0 + noise)))
+    assert 0.0 < row.p_value < 0.01
+    assert (row.stages, row.epochs) == ((SHORT.early_epochs,), SHORT.early_epochs)
+    assert (found.winner, found.competing, found.alone_mm) == ("creep", (), pytest.approx(2.0))
+    assert found.confidence == pytest.approx(1.0 - row.p_value)
+    assert {(job.part, job.seed) for job in jobs} == {(0, SHORT.seed), (1, SHORT.seed + 1)}
+
+
+def test_an_interval_and_a_spread_come_from_blocks_and_from_seeds(problem, monkeypatch):
+    """Creep leaves 1 mm in one part and half a millimetre in the other."""
+    part = Split.of(problem, SHORT).part
+    with_errors(monkeypatch, {None: 2.0, "creep": np.where(part == 0, 1.0, 0.5)})
+    (row,) = refit(problem, without=only("creep"), config=SHORT).candidates
+    assert row.seeds_mm == pytest.approx((1.0, 0.5))
+    assert row.spread_mm == pytest.approx(0.5 / np.sqrt(2.0))
+    low, high = row.ci95_mm
+    assert 1.0 < low < row.difference_mm < high < 1.5
+
+
+HALF = np.arange(20) % 2 == 0
+"""Every other one of 20 blocks."""
+FEW = np.isin(np.arange(20), (3, 8, 13))
+"""Three of them."""
+
+
+@pytest.mark.parametrize(
+    ("errors", "winner", "competing", "of_line"),
+    [
+        ({"creep": 0.5, "softening": 1.5}, "creep", (), False),
+        ({"creep": 0.5, "softening": 0.8}, "creep", (), False),
+        ({"creep": 0.5, "softening": 0.505}, "creep", ("softening",), False),
+        ({"creep": 0.5, "softening": np.where(HALF, 0.13, 1.3)}, "creep", ("softening",), False),
+        ({"creep": 0.5, "softening": np.where(HALF, 0.05, 2.0)}, "creep", (), False),
+        ({"creep": 0.5, "line_lag": 0.505}, "line_lag", ("creep",), True),
+        ({"creep": 0.5, "line_lag": 1.5}, "creep", (), False),
+        ({"creep": 1.8, "softening": 1.9}, None, (), False),
+        ({None: np.where(FEW, 5.0, 1.0), "creep": np.where(FEW, 0.5, 1.0)}, None, (), False),
+    ],
+    ids=["alone", "worse", "alike", "unsure", "less", "line", "wall", "small", "chance"],
+)
+def test_who_wins_and_who_competes(problem, monkeypatch, errors, winner, competing, of_line):
+    """Of 2 mm. Alike: within 2 % of the gain. Unsure: more in some blocks and less in others, with
+    four fifths of the gain or more. A line's lag is that of a command. A gain has to be large and
+    in more blocks than chance gives."""
+    with_errors(monkeypatch, {None: 2.0, **errors})
+    found = refit(problem, without=only(*errors), config=SHORT)
+    assert (found.winner, found.competing, found.of_line) == (winner, competing, of_line)
+    assert found.ambiguous is bool(competing and not of_line)
+    assert (found.confidence > 0.0) == (winner is not None)
+    if competing:
+        assert found.confidence == pytest.approx(0.81), "other effects do about as well"
+
+
+def test_an_effect_beyond_plausibility_in_one_training_is_not_named(problem, monkeypatch):
+    """Neither is it trained on in the place of another one: two of three are, for longer."""
+    errors = {None: 2.0, "creep": 0.4, "softening": 0.7, "inertia": 1.0}
+    jobs = with_errors(monkeypatch, errors, implausible=[("creep", 1)])
+    found = refit(problem, without=only("creep", "softening", "inertia"), config=SHORT)
+    assert not found.of("creep").plausible
+    assert not found.of("creep").named
+    assert found.winner == "softening"
+    last = {job.effects for job in jobs if job.epochs == SHORT.epochs}
+    assert last == {(), ("softening",), ("inertia",)}
+    jobs = with_errors(monkeypatch, errors)
+    refit(problem, without=only("creep", "softening", "inertia"), config=SHORT)
+    last = {job.effects for job in jobs if job.epochs == SHORT.epochs}
+    assert last == {(), ("creep",), ("softening",)}, "the best ones"
+
+
+def test_what_is_left_out_at_once(problem, lagging):
+    """Blocks beside each other; of runs those of one kind; blocks where a run is far from all."""
+    recording, model = lagging
+    one = Split.of(problem, SHORT)
+    changes = np.flatnonzero(np.diff(one.part))
+    assert len(changes) > 2
+    assert (np.diff(changes) == TOGETHER).all()
+    again = replace(recording, name="again")
+    other = arm_by_hand(rows=1200)
+    moved = command(1200, seed=5)
+    other = replace(other, name="other", measured=moved, commanded=moved)
+    runs = [recording, again, other, replace(other, name="once more")]
+    split = Split.of(identification_problem(model, runs), SHORT)
+    assert split.unit_name == "runs"
+    run = split.problem.history.run_of_row[split.problem.index].numpy()
+    parts = [set(split.part[split.problem.block[run == number]].tolist()) for number in range(4)]
+    assert parts[0] == parts[1]
+    assert parts[2] == parts[3]
+    assert parts[0] | parts[2] == {0, 1}
+    assert len(split.unit) > 4
+    low, high = (
+        replace(recording, name=name, measured=x, commanded=x)
+        for name, x in (("low", recording.measured / 4), ("high", 45 + recording.measured / 4))
+    )
+    far = Split.of(identification_problem(model, [low, high]), SHORT)
+    assert far.unit_name == "blocks of time"
+
+
+def test_units_are_enough_for_a_p_value_of_every_effect():
+    """Of K units no p-value is below 2^-K; a family of effects shares the asked one."""
+    family = sum(not issubclass(kind, Memoryless) for kind in known_effects().values())
+    assert 2.0 ** -least_units() * family <= ASKED.p_value < 2.0 ** -(least_units() - 1) * family
+
+
+def test_effects_apart_are_fitted_without_the_part_that_judges_them(problem, monkeypatch):
+    seen = []
+
+    def fitted(posed, names):
+        seen.append(set(posed.index.tolist()))
+        return SimpleNamespace(model=posed.model)
+
+    monkeypatch.setattr(refitting, "fit_effects", fitted)
+    unknown = replace(problem, model=problem.model.replace())
+    unknown.model.fitted_rows = None
+    found = apart_mm(unknown, ["line_lag"], SHORT)
+    assert found == pytest.approx(problem.rmse_mm), "nothing was fitted"
+    part = Split.of(unknown, SHORT).part[unknown.block]
+    for number, rows in enumerate(seen):
+        assert rows == set(unknown.index[torch.from_numpy(part != number)].tolist())
+
+
+def test_a_joint_fit_sees_every_row_and_states_the_refits_error(problem, found, monkeypatch):
+    jobs, rows = [], []
+
+    def run(split, job):
+        jobs.append(job)
+        rows.append(split.rows)
+        return Outcome(job.model, np.zeros((20, 2)), (*job.before, job.epochs))
+
+    monkeypatch.setattr(refitting, "run_job", run)
+    best = replace(found.of("line_lag"), stages=(2,), heldout_rmse_mm=0.3, rival_mm=0.9)
+    few = replace(SHORT, rows=100)
+    joint = fit_together(problem, ["line_lag"], best, few)
+    assert rows == [len(problem.index)] * 2
+    assert [job.part for job in jobs] == [None, None]
+    assert [job.effects for job in jobs] == [("line_lag",), ()]
+    assert joint.model.validation.rmse_mm == 0.3
+    assert joint.model.validation.per_key_point_mm == best.per_key_point_mm
+    assert joint.model.validation.rows == len(problem.index)
 
 
 def test_the_rival_trains_on_the_same_rows_for_as_many_epochs(problem, monkeypatch):

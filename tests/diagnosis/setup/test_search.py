@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from surgisoft.diagnosis.setup import find_setup_faults
+from surgisoft.diagnosis.setup.alignment import Frame, block_moments, fitted
 from surgisoft.diagnosis.setup.sample import Arrangement, samples_of
-from surgisoft.diagnosis.setup.search import Hypothesis, Levels, Search
+from surgisoft.diagnosis.setup.search import Border, Fitted, Hypothesis, Levels, Search
 from surgisoft.surrogate.checkpoint import default_arm
 from tests.diagnosis.setup.recordings import late, measured, predicted, with_points
 
@@ -36,3 +38,61 @@ def test_a_correction_is_judged_on_blocks_that_took_no_part_in_its_fit(model):
     of_all = float(found.blocks.summed().mean_square(found.frame))
     assert found.rmse_mm**2 > 1.02 * of_all
     assert of_all > 1.0
+
+
+def test_the_errors_of_a_frame_are_those_of_means_over_blocks():
+    """Twelve blocks of time with a turn about z and a shift of their own, about the origin: the
+    standard error of a mean is the deviation over the root of 12."""
+    rng = np.random.default_rng(0)
+    true = rng.normal(size=(12, 40, 4, 3)) * 30.0
+    true -= true.mean((1, 2), keepdims=True)
+    turns, shifts = 0.01 * rng.normal(size=12), rng.normal(size=(12, 3))
+    rotation = Rotation.from_rotvec(turns[:, None] * [0.0, 0.0, 1.0]).as_matrix()
+    seen = np.einsum("bij,brkj->brki", rotation, true) + shifts[:, None, None]
+    scale = 0.1  # recorded in cm
+    block = np.repeat(np.arange(12), 40)
+    blocks = block_moments(scale * seen.reshape(-1, 4, 3), true.reshape(-1, 4, 3), block, 12)
+    frame = fitted(blocks.summed(), 1.0, np.asarray(scale))
+    hypothesis = Hypothesis(Arrangement.as_recorded(3), tuple(range(4)), frame="proper")
+    found = Fitted(hypothesis, frame, blocks, np.zeros(12), 0.0)
+    turn, shift = found.turn_and_shift_errors()
+    np.testing.assert_allclose(shift, shifts.std(0, ddof=1) / np.sqrt(12.0), rtol=1e-6)
+    assert turn == pytest.approx(turns.std(ddof=1) / np.sqrt(12.0), rel=0.1)
+
+
+def test_a_misalignment_ends_at_its_turn_and_at_its_shift_in_millimetres():
+    """A shift of 0.5 and 1.5 in a recording in cm, with a limit of 10 mm; a turn of 0.1 rad."""
+    border = Border(0.1, 10.0)
+    for turn, shift_cm, holds in ((0.09, 0.5, True), (0.11, 0.5, False), (0.09, 1.5, False)):
+        rotation = Rotation.from_rotvec([0.0, turn, 0.0]).as_matrix()
+        frame = Frame(rotation, np.array([0.0, 0.0, -shift_cm]), 0.1)
+        assert border.holds(frame) == holds
+
+
+def test_an_error_is_explained_by_what_falls_above_the_validated_one(model):
+    """A validated error of 0.4 mm and a noise of 0.3 mm make 0.5 mm: of 2 mm nine tenths of the
+    squared error above that are explained down to 0.79 mm, and what is not noticed is not."""
+    coarse, fine, full = samples_of(model, [predicted()], (200, 400, 400))
+    search = Search(coarse, fine, full, Levels(0.3, 0.4), {})
+    assert search.levels.reference == pytest.approx(0.5)
+    assert search.limit_mm == pytest.approx(0.5 * search.proof.noticed)
+    for before, after, explained in ((2.0, 0.78, True), (2.0, 0.80, False), (2.0, 0.1, True)):
+        assert search.explains(before, after) is explained
+    assert not search.explains(0.99 * search.limit_mm, 0.1)
+    assert search.explains(1.01 * search.limit_mm, 0.5)
+
+
+def test_the_error_of_an_offset_is_the_spread_of_offsets_that_are_found(model):
+    """Eight recordings that are 0.3 s late, with a noise of 1 mm in every coordinate."""
+    found, rng = [], np.random.default_rng(0)
+    original, as_it_is = predicted(1200), Arrangement.as_recorded(3)
+    given = Hypothesis(as_it_is, tuple(range(5)), frame="none", later_s=0.3)
+    for _ in range(8):
+        noise = rng.normal(0.0, 1.0, original.key_points_mm.shape)
+        noisy = late(with_points(original, original.key_points_mm + noise), 3)
+        samples = samples_of(model, [noisy], (100, 600, 1200))
+        fit = Search(*samples, Levels(1.0, 0.3), {}).fit(given)
+        found.append((fit.hypothesis.later_s, fit.later_sd_s))
+    later, errors = np.array(found).T
+    assert 0.5 < errors.mean() / later.std(ddof=1) < 2.5
+    assert abs(later.mean() - 0.3) < 2.0 * errors.mean()

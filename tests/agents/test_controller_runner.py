@@ -111,3 +111,87 @@ def test_a_sample_that_cannot_be_is_refused(driven, pressure, dt_s, message):
     with pytest.raises(ValueError, match=message):
         controller.observe(pressure, POINTS, REST, dt_s)
     assert not graph.given
+
+
+@pytest.fixture
+def signalled():
+    """A controller of two arms with a signal that has to be given and one that need not be."""
+    arms = [
+        {"name": name, "chambers": 2, "key_points": 1, "lowest_kPa": [0, 0], "highest_kPa": [9, 9]}
+        for name in ("one", "two")
+    ]
+    signals = [
+        {"name": "view", "meaning": "share seen", "default": None, "optional": False},
+        {"name": "at_target", "meaning": "1 at the target", "default": None, "optional": True},
+        {"name": "out_mm", "meaning": "the feed", "default": 2.5, "optional": False},
+    ]
+    about = {
+        "episode_steps": 3,
+        "controller": {
+            "arms": arms,
+            "state": {"leaves": [], "initial": [0.0]},
+            "signals": signals,
+            "goal": [],
+            "outputs": ["next_state", "one_command_kPa", "two_command_kPa"],
+        },
+    }
+    given = []
+
+    def graph(values):
+        given.append(values)
+        return [values["state"], np.array([[1.0, 2.0]]), np.array([[3.0, 4.0]])]
+
+    return Controller.of(about, graph), given
+
+
+def test_signals_that_have_to_be_given_are_asked_for(signalled):
+    controller, given = signalled
+    each = {"one": REST, "two": REST}
+    points = {"one": POINTS, "two": POINTS}
+    command = controller.begin(each, points, each, 0.1, view=0.75)
+    assert {name: value.tolist() for name, value in command.items()} == {
+        "one": [1.0, 2.0],
+        "two": [3.0, 4.0],
+    }
+    assert given[0]["view"].tolist() == [0.75]
+    assert np.isnan(given[0]["at_target"]).all(), "left to the model"
+    assert given[0]["out_mm"].tolist() == [2.5], "its default"
+    controller.step(each, points, 0.1, view=0.5, at_target=1.0)
+    assert given[1]["at_target"].tolist() == [1.0]
+    assert given[1]["two_commanded_kPa"].tolist() == [[3.0, 4.0]]
+    for signals in ({}, {"view": math.nan}):
+        with pytest.raises(ValueError, match="signal 'view' is missing: share seen"):
+            controller.step(each, points, 0.1, **signals)
+    with pytest.raises(ValueError, match="signal 'sight' is not known, expected view, at_target"):
+        controller.step(each, points, 0.1, view=1.0, sight=1.0)
+    assert len(given) == 2
+
+
+def test_measurements_of_other_arms_or_shapes_are_refused(signalled, driven):
+    controller, given = signalled
+    each, points = {"one": REST, "two": REST}, {"one": POINTS, "two": POINTS}
+    with pytest.raises(ValueError, match="arm 'two' is missing, got one"):
+        controller.observe({"one": REST}, points, each, 0.1, view=1.0)
+    with pytest.raises(ValueError, match="expected a dict with the arms one, two"):
+        controller.observe(REST, points, each, 0.1, view=1.0)
+    assert not given
+    alone, graph = driven
+    with pytest.raises(ValueError, match=r"shape \(3,\), expected \(2,\)"):
+        alone.observe([1.0, 2.0, 3.0], POINTS, REST, 0.1)
+    with pytest.raises(ValueError, match="goal 'end' is not known, expected start"):
+        alone.begin(REST, POINTS, REST, 0.1, goal={"end": 0.5})
+    with pytest.raises(ValueError, match="has shape"):
+        alone.set(arms__arm__plant__lowest_kPa=[1.0])
+    with pytest.raises(ValueError, match="'mount' is not in the state"):
+        alone.set(mount=1.0)
+    assert not graph.given
+
+
+def test_an_episode_that_has_not_begun_is_not_over(driven):
+    controller, _ = driven
+    for _ in range(4):
+        controller.observe(REST, POINTS, REST, 0.1)
+    assert controller.steps == 4
+    assert not controller.done
+    controller.begin(REST, POINTS, REST, 0.1)
+    assert controller.done

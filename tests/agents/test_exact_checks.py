@@ -292,3 +292,88 @@ def test_an_exact_contact_is_no_success(task, monkeypatch):
     found = evaluate(short, "random", Random(2), 1, seed=1)
     assert found.per_episode["success"].tolist() == [0.0]
     assert found.per_episode["collided"].tolist() == [1.0]
+
+
+def far_apart(task, apart_mm, count=1):
+    """(R, K, 3) lines of two parallel arms, far from all bodies, their axes so far apart."""
+    along = torch.linspace(0.0, 50.0, 21)[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    first = (torch.tensor([0.0, 0.0, 400.0]) + along)[None].repeat(count, 1, 1)
+    shift = torch.tensor([0.0, 1.0, 0.0]) * apart_mm
+    names = list(task.world.scene.geometry.radii_mm)
+    return {names[0]: first, names[1]: first + shift}
+
+
+def seen_at(task, state, step, apart_mm, said_mm):
+    """The state at a step with its arms so far apart, whose batched clearance says something."""
+    lines = far_apart(task, apart_mm)
+    arms = {name: replace(part, line_mm=lines[name]) for name, part in state.world.arms.items()}
+    clearance = task.world.scene.geometry.clearance(lines)
+    clearance = replace(clearance, arms_mm=torch.full_like(clearance.arms_mm, said_mm))
+    scene = replace(state.world.scene, clearance=clearance)
+    steps = torch.full_like(state.world.steps, step)
+    return replace(state, world=replace(state.world, arms=arms, scene=scene, steps=steps))
+
+
+def test_the_least_clearances_of_an_episode_are_checked(task):
+    """Of five steps the three nearest ones by the batched geometry are computed exactly; it is off
+    by 0.5 mm in the nearest of them, by 0.2 mm elsewhere, and by 5 mm where it is far."""
+    state = Episodes(task).seeded(0, 1)
+    radii = sum(task.world.scene.geometry.radii_mm.values())
+    steps = [(50.0, 5.0), (40.0, 0.2), (10.0, 0.5), (30.0, 0.2), (20.0, 0.2)]
+    states = [
+        seen_at(task, state, step, radii + mm, mm + off) for step, (mm, off) in enumerate(steps)
+    ]
+    for order in (states, states[::-1]):
+        check = looked_at(task, *order)
+        assert check.steps == 5
+        assert check.clearance_mm == pytest.approx(10.0, abs=1e-4)
+        assert check.clearance_off_mm == pytest.approx(0.5, abs=1e-3)
+        assert (check.contact, check.contact_differs) == (None, 0)
+
+
+def test_a_contact_that_cannot_be_is_counted_without_fcl(task):
+    """The batched geometry says that arms 30 mm apart overlap; FCL is not asked, nor audited."""
+    state = Episodes(task).seeded(0, 1)
+    radii = sum(task.world.scene.geometry.radii_mm.values())
+    check = looked_at(task, seen_at(task, state, 3, radii + 30.0, -0.1))
+    assert (check.contact_differs, check.asked, check.audited) == (1, 0, 0)
+    assert check.contact is None
+
+
+def test_episodes_that_are_over_are_not_looked_at(task):
+    state = Episodes(task).seeded(0, 3)
+    watch = ExactChecks(task)
+    failed = replace(state, world=replace(state.world, failed=torch.tensor([False, False, True])))
+    live = torch.tensor([True, False, True])
+    watch(Instant(torch.tensor([4, 5, 6]), failed, None, None, live))
+    assert [check.steps for check in watch.checks()] == [1, 0], "4 and the failed 6"
+    assert [check.steps for check in watch.checks(1)] == [1]
+    watch(Instant(torch.tensor([4, 5, 6]), state, None, None, ~live))
+    assert [check.steps for check in watch.checks()] == [1, 1, 0]
+
+
+@pytest.mark.parametrize(
+    ("moved_mm", "turned_mm", "again"),
+    [(4.4, 0.0, False), (4.5, 0.0, True), (0.0, 4.5, True), (0.0, 4.4, False)],
+)
+def test_two_arms_may_both_have_come_nearer(task, monkeypatch, moved_mm, turned_mm, again):
+    """10 mm apart, a margin of 1.1 mm: 4.45 mm of both, of all of an arm or of its tip alone."""
+    scene = task.world.scene.geometry
+    radii = sum(scene.radii_mm.values())
+    start, calls, whole = far_apart(task, radii + 10.0, 2), [], type(scene).clearance
+    monkeypatch.setattr(
+        type(scene), "clearance", lambda self, *a: calls.append(1) or whole(self, *a)
+    )
+    last, episodes = LastClearance(scene), np.array([3, 8])
+    assert last.out_of_contact(episodes, start).all()
+    assert len(calls) == 1
+    assert last.out_of_contact(episodes, start).all()
+    assert len(calls) == 1
+    one, other = start
+    share = torch.linspace(0.0, 1.0, 21)[:, None]
+    step = (moved_mm + turned_mm * share) * torch.tensor([0.0, 1.0, 0.0])
+    moved = {one: start[one].clone(), other: start[other].clone()}
+    moved[one][1] += step  # of the second episode alone
+    moved[other][1] -= step
+    assert last.out_of_contact(episodes, moved).all()
+    assert len(calls) == 1 + again

@@ -1,8 +1,10 @@
 """Which effects a schedule can tell apart: against dense algebra, and against what must hold."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
-from scipy import linalg
+from scipy import linalg, stats
 
 from surgisoft.diagnosis.design.isolability import (
     FORM_S,
@@ -10,7 +12,9 @@ from surgisoft.diagnosis.design.isolability import (
     ROOM,
     SURE,
     Draws,
+    Form,
     Moments,
+    Sizes,
     Uncertainty,
     history_of_protocol,
     inducing_points,
@@ -22,6 +26,7 @@ from surgisoft.diagnosis.design.isolability import (
 from surgisoft.diagnosis.discrepancy import body_covariance, kernel
 from surgisoft.measurement.protocols import Protocol, make_protocol
 from surgisoft.surrogate.checkpoint import default_arm
+from surgisoft.surrogate.model import Validation
 
 LIMITS = np.array([[-15.0, 54.0]] * 3)
 NAMES = ["hysteresis", "line_lag", "creep", "rate_dependence"]
@@ -194,3 +199,91 @@ def test_an_arm_without_a_stated_length_still_has_plausible_sizes(arm):
     uncertainty = uncertainty_of(arm, None, np.full(5, 0.5), 0.05)
     assert (uncertainty.density > 0).all()
     assert uncertainty.discrepancy_mm.shape == (5,)
+
+
+def of_gram(gram, seconds=90.0):
+    """Moments whose sensitivities have the products (K, K), with no discrepancy among them."""
+    gram = np.array(gram, float)
+    return Moments(
+        gram[None], np.zeros((3, 1, 1, len(gram))), np.zeros((1, 1)), np.ones(1), seconds
+    )
+
+
+def test_the_chance_to_tell_two_apart_by_hand():
+    """Squared lengths 16 and 9, of which the other one imitates a quarter each, or 1 of 16 in
+    another form of it; a misfit of 10 % and 30 % of the true one's square lies along the way."""
+    moments = of_gram([[16.0, 6.0, 2.0], [6.0, 9.0, 0.0], [2.0, 0.0, 4.0]])
+    draws = Draws(np.eye(3)[:, :2], np.array([0, 1]))
+    spans = [np.array([k]) for k in range(3)]
+    misfit = np.array([[0.0, 0.1], [0.3, 0.0]])
+    found = isolability_from(moments, draws, ["a", "b", "b"], spans, misfit)
+    assert found.names == ("a", "b")
+    assert found.minutes == 1.5
+    np.testing.assert_allclose(found.detectable, [8.0, 4.5])
+    np.testing.assert_allclose(found.log_evidence, [[0.0, 6.0], [3.375, 0.0]], rtol=1e-4)
+    np.testing.assert_allclose(found.separability, [[0.0, 0.75], [0.75, 0.0]], rtol=1e-4)
+    a, b = 0.5 * np.sqrt(12.0 / (1.0 + 0.1 * 16.0)), 0.5 * np.sqrt(6.75 / (1.0 + 0.3 * 9.0))
+    np.testing.assert_allclose(found.distance, [[0.0, a], [b, 0.0]], rtol=1e-4)
+    chance = stats.norm.cdf([a, b])
+    np.testing.assert_allclose(found.confidence, [[0.5, chance[0]], [chance[1], 0.5]], rtol=1e-4)
+    assert found.pair("a", "b") == found.pair("b", "a") == pytest.approx(chance[1], rel=1e-4)
+    # 4 and 3 standard deviations from nothing: seen with 97.7 % and with 93.3 %, of 95 % asked for.
+    assert found.seen.tolist() == [1.0, 0.0]
+
+
+def test_plausible_sizes_by_hand():
+    """One amplitude that moves the second of two key points by 1 mm: 0.71 mm RMS over both."""
+    reference = SimpleNamespace(model=SimpleNamespace(spec=SimpleNamespace(key_points=2)))
+    one, two = np.zeros((8, 2, 3, 1)), np.zeros((8, 2, 3, 2))
+    one[:, 1, 0] = 1.0
+    two[:, :, 1, 0], two[:, :, 2, 1] = 2.0, 3.0
+    nothing = np.zeros((8, 2, 3, 1))
+    forms = [Form(name, None) for name in ("a", "none", "b")]
+    sizes = Sizes.of(reference, [one, nothing, two], forms, size_mm=0.4)
+    assert [form.name for form in sizes.forms] == ["a", "b"]
+    np.testing.assert_allclose(sizes.gram_mm2[0], [[0.5]])
+    np.testing.assert_allclose(sizes.gram_mm2[1], [[4.0, 0.0], [0.0, 9.0]])
+    assert [span.tolist() for span in sizes.spans] == [[0], [1, 2]]
+    # At the size of 1 each, the first form moves the second key point alone, the other one both.
+    np.testing.assert_allclose((sizes.profile_mm / 0.4) ** 2, [0.5, 1.5])
+    draws = sizes.draws()
+    assert draws.form.tolist() == [0] + [1] * 6
+    assert draws.amplitudes[0, 0] == pytest.approx(0.4 * np.sqrt(2.0))
+    many = np.concatenate([sizes.draws(seed).amplitudes[1:, 1:] for seed in range(200)], axis=1)
+    squares = np.sum((many * [[2.0], [3.0]]) ** 2, axis=0)
+    assert np.sqrt(squares.mean()) == pytest.approx(0.4, rel=0.05), "of orthogonal columns"
+    grown = sizes.limited(draws, [100.0 * one, 100.0 * two])
+    for k, columns in enumerate([one] + [two] * 6):
+        field = 100.0 * columns @ grown.amplitudes[sizes.spans[grown.form[k]], k]
+        assert np.sqrt(np.mean(np.sum(field**2, axis=2))) == pytest.approx(2.0 * 0.4)
+    same = sizes.limited(draws, [one, two])
+    within = np.abs(draws.amplitudes).max(0) < 2.0 * 0.4 / 3.0
+    np.testing.assert_array_equal(same.amplitudes[:, within], draws.amplitudes[:, within])
+    only = sizes.select([1])
+    assert [span.tolist() for span in only.spans] == [[0, 1]]
+    np.testing.assert_array_equal(only.gram_mm2[0], sizes.gram_mm2[1])
+
+
+def test_uncertainty_by_hand(arm):
+    """Cameras see a thousandth of the length, an unknown model errs by a twentieth of it."""
+    unknown = arm.replace(validation=Validation())
+    length, signal = arm.spec.length_mm, np.full(5, 0.3)
+    found = uncertainty_of(unknown, None, signal, 0.1)
+    np.testing.assert_allclose(found.noise_mm, 0.001 * length)
+    np.testing.assert_allclose(found.discrepancy_mm, 0.05 * length)
+    per_s = ((0.001 * length) ** 2 * 0.1 + FORM_SHARE * 0.09 * FORM_S) / 3.0
+    np.testing.assert_allclose(found.density, per_s)
+    slow = uncertainty_of(unknown, np.full(5, 0.2), signal, 60.0)
+    np.testing.assert_allclose(slow.density, (0.04 * 60.0 + FORM_SHARE * 0.09 * 60.0) / 3.0)
+    known = uncertainty_of(arm, None, signal, 0.1)
+    np.testing.assert_allclose(known.discrepancy_mm, arm.validation.per_key_point_mm)
+
+
+def test_settled_points_lie_their_time_of_settling_and_of_averaging_apart(arm):
+    settled = make_protocol("grid", LIMITS, 64)
+    history = history_of_protocol(arm, settled)
+    apart = settled.settle_s + settled.average_s
+    np.testing.assert_allclose(history.dt_s[0, 1:], apart, rtol=1e-5)
+    assert isolability(arm, settled, ["payload", "twist"]).minutes == pytest.approx(
+        len(settled.commands) * apart / 60.0, rel=0.02
+    )

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from surgisoft.errors import InputError
+from surgisoft.surrogate import prior_mean
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
 from surgisoft.surrogate.compiled_step import CompiledStep
@@ -97,6 +98,56 @@ def test_a_chamber_that_hardly_moved_gets_no_bend_of_its_own():
     prior = ArcChain(LOW, HIGH, 3, 2)
     fit_prior_mean(prior, seen, torch.tensor(arm(np.zeros((1, 2)))[0]).float())
     assert float(prior.table[:, :2, 1].detach().abs().max()) < 0.1
+
+
+def test_the_fit_is_the_minimum_of_the_documented_sum(monkeypatch):
+    """mean |left|^2 + v (ridge |bends|^2 + stretch_ridge |stretches|^2 + offset_ridge |offsets|^2),
+    v the mean squared motion: no step of a parameter makes it less. Steady terms cost nothing.
+    The ridges are large here."""
+    ridge, stretch_ridge, offset_ridge = 0.3, 3.0, 0.7
+    monkeypatch.setattr(prior_mean, "RIDGE", ridge)
+    monkeypatch.setattr(prior_mean, "STRETCH_RIDGE", stretch_ridge)
+    monkeypatch.setattr(prior_mean, "OFFSET_RIDGE", offset_ridge)
+    rng = np.random.default_rng(2)
+    pressure = rng.uniform(0, 50, (60, 2))
+    points = 1.1 * arm(pressure) + rng.normal(0, 2.0, (60, 3, 3)) + [0.0, 3.0, 0.0]
+    points[::7, 1] = np.nan
+    prior = ArcChain(LOW, HIGH, 3, 2)
+    prior.set_rest(torch.tensor(arm(np.zeros((1, 2)))[0]).float())
+    fit_arcs(prior, torch.tensor(pressure), torch.tensor(points), iterations=100)
+    seen = np.isfinite(points)
+    count = seen.sum() / 3
+    motion = np.nansum((points - np.nanmean(points, 0)) ** 2) / count
+
+    def total():
+        with torch.no_grad():
+            left = (points - prior(torch.tensor(pressure)).numpy())[seen]
+            own = prior.table[..., :-1].numpy()
+        held = ridge * (own[:, :2] ** 2).sum() + stretch_ridge * (own[:, 2] ** 2).sum()
+        held += offset_ridge * (prior.offset.detach().numpy() ** 2).sum()
+        return (left**2).sum() / count + motion * held
+
+    prior.double()
+    least = total()
+    for parameter in prior.parameters():
+        flat = parameter.data.view(-1)
+        for k, value in enumerate(flat.tolist()):
+            for step in (-0.01, 0.01):
+                flat[k] = value + step
+                assert total() > least * (1.0 - 1e-7), (parameter.shape, k)
+            flat[k] = value
+
+
+def test_a_marker_off_its_arc_turns_with_the_arcs_end():
+    """A quarter circle in x and z: an offset along x points down the z axis at its end."""
+    prior = ArcChain(LOW, HIGH, 2, 1)
+    prior.set_rest(torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 100.0]]))
+    with torch.no_grad():
+        prior.table[0, 0, -1] = math.pi / 2.0
+        prior.offset[0] = torch.tensor([0.1, 0.0, 0.0])  # in lengths of an arc
+    radius = 100.0 / (math.pi / 2.0)
+    expected = torch.tensor([[0.0, 0.0, 0.0], [radius, 0.0, radius - 10.0]])
+    assert torch.allclose(prior(torch.full((1, 2), 25.0))[0], expected, atol=1e-3)
 
 
 def test_an_arm_at_rest_along_any_axis_is_recovered():

@@ -112,3 +112,62 @@ def test_a_chamber_that_does_not_act(model):
     assert found.kinds == ("chambers",)
     assert "chamber 1 does not act" in found.sentence
     assert not found.correctable
+
+
+def sensed(rows=2400):
+    """A recording whose pressure sensors have noise, so that no reading comes again."""
+    original = measured(rows)
+    noise = np.random.default_rng(1).normal(0.0, 0.02, original.measured.shape)
+    return replace(original, measured=original.measured + noise)
+
+
+@pytest.mark.parametrize(("stop", "counts"), [(1100, True), (680, False)])
+def test_a_channel_frozen_for_a_while_hides_those_rows(model, stop, counts):
+    """A fifth of the rows of one recording of two; or 3 % of one, which is only warned of."""
+    original = sensed()
+    values = original.measured.copy()
+    values[600:stop, 1] = values[600, 1]
+    frozen = replace(original, measured=values)
+    recordings = [frozen, sensed()] if counts else [frozen]
+    dead, masked, driven = dead_channels(model.spec, recordings)
+    assert dead.chambers == ()
+    lost = np.isnan(masked[0].key_points_mm).all((1, 2))
+    if not counts:
+        assert not dead
+        assert not lost.any()
+        return
+    assert dead.frozen == {1: pytest.approx(500 / 4800, abs=0.001)}
+    assert lost[601:1100].all()
+    assert not lost[:600].any()
+    assert not lost[1100:].any()
+    assert np.isfinite(masked[1].key_points_mm).all()
+    assert driven is masked, "the command takes the place of dead channels alone"
+
+
+def test_a_key_point_frozen_in_few_rows_is_only_warned_of(model):
+    original = measured()
+    points = original.key_points_mm.copy()
+    points[600:700, 4] = points[600, 4]
+    dead, masked, _ = dead_channels(model.spec, [with_points(original, points)])
+    assert not dead
+    np.testing.assert_array_equal(masked[0].key_points_mm, points)
+    points[600:760, 4] = points[600, 4]
+    dead, masked, _ = dead_channels(model.spec, [with_points(original, points)])
+    assert dead.key_points == {4: pytest.approx(160 / 2400, abs=0.001)}
+    assert np.isnan(masked[0].key_points_mm[610:750, 4]).all()
+    assert np.isfinite(masked[0].key_points_mm[:, :4]).all()
+
+
+@pytest.mark.parametrize(("share", "dead"), [(0.1, ()), (0.01, ()), (0.001, (1,))])
+def test_a_channel_that_moves_a_little_is_not_dead(model, share, dead):
+    """A hundredth of the range of the others is a motion, a thousandth is noise."""
+    values = measured().measured * [1.0, share, 1.0]
+    assert dead_channels(model.spec, [replace(measured(), measured=values)])[0].chambers == dead
+
+
+def test_a_model_of_commands_has_no_dead_sensor(model):
+    """Its chambers follow the commands, whatever a sensor reads."""
+    still = [without_channel(measured(), 1)]
+    asked = replace(model.spec, actuation="commanded")
+    assert dead_channels(asked, still)[0].chambers == ()
+    assert dead_channels(model.spec, still)[0].chambers == (1,)

@@ -9,6 +9,8 @@ import tomli_w
 
 from surgisoft.cli import run
 from surgisoft.diagnosis.setup import find_setup_faults
+from surgisoft.diagnosis.setup.correction import Correction
+from surgisoft.diagnosis.setup.sample import Arrangement
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.importing import import_files, load_map
 from surgisoft.measurement.recordings import load_recording, save_recording
@@ -75,6 +77,26 @@ def test_the_lines_of_the_map_mend_like_apply(name, tmp_path):
     np.testing.assert_allclose(np.diff(part.recording.t_s), np.diff(corrected.t_s), atol=1e-9)
     np.testing.assert_allclose(part.recording.key_points_mm, corrected.key_points_mm, atol=2e-2)
     assert find_setup_faults(default_arm(), [part.recording]) is None
+
+
+def test_what_was_recorded_besides_stays_with_its_row():
+    """The log is two rows late: the last two rows go, and with them their temperature and load."""
+    given = measured(50)
+    t_s, model = given.t_s, default_arm()
+    given = replace(given, temp_C=20.0 + t_s, payload_g=3.0 * t_s, commanded=5.0 * given.measured)
+    same = Arrangement.as_recorded(3)
+    correction = Correction(same, tuple(range(5)), model.spec.unit, "kPa", delay_s=0.2)
+    found = correction.applied(given)
+    np.testing.assert_allclose(found.t_s, t_s[:-2])
+    np.testing.assert_allclose(found.temp_C, 20.0 + t_s[:-2])
+    np.testing.assert_allclose(found.payload_g, 3.0 * t_s[:-2])
+    np.testing.assert_allclose(found.key_points_mm, given.key_points_mm[:-2])
+    np.testing.assert_allclose(found.measured, given.measured[2:], atol=1e-9)
+    np.testing.assert_allclose(found.commanded, given.commanded[2:], atol=1e-9)
+    between = replace(correction, delay_s=0.15).applied(given)
+    middle = 0.5 * (given.measured[1:-1] + given.measured[2:])
+    np.testing.assert_allclose(between.measured, middle, atol=1e-9)
+    np.testing.assert_allclose(between.commanded, given.commanded[1:-1], err_msg="held until set")
 
 
 ROWS = 1000

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from surgisoft.cli import run
-from surgisoft.diagnosis.amend import Fall, amend, fall_of, track_of
+from surgisoft.diagnosis.amend import Amendment, Fall, amend, fall_of, track_of
 from surgisoft.diagnosis.compare import compare
 from surgisoft.diagnosis.estimation.network import Retuned, retune
 from surgisoft.diagnosis.residuals import held_out_rows, problem_of, residual_table
@@ -259,6 +259,56 @@ def test_a_fall_is_claimed_where_it_is_significant_and_large():
     assert not replace(fall, ci95=(-0.01, 0.4)).claimed
     assert not replace(fall, fall=0.04, ci95=(0.02, 0.06)).claimed
     assert replace(fall, fall=0.06, ci95=(0.02, 0.1)).claimed
+
+
+def test_a_fall_that_chance_or_the_fit_explains_is_not_claimed():
+    """Also not one of a twentieth of next to nothing: a tenth of the error is what it is of."""
+    fall = Fall(1.2, 1.0, 0.2, fall=0.2, ci95=(0.1, 0.3), rows=9, blocks=3)
+    assert replace(fall, p_value=0.04).claimed
+    chance = replace(fall, p_value=0.06)
+    assert not chance.significant
+    assert "may be the network's own error, which the effect resembles (p 0.06)" in chance.sentence
+    seen = replace(fall, in_fit=0.3)
+    assert seen.significant
+    assert not seen.claimed
+    assert "fitted to 30% of the held-out rows" in seen.sentence
+    assert seen.sentence.endswith("(fall 0.200 mm, 95 % 0.100 to 0.300; floor 0.200 mm)")
+    assert replace(fall, in_fit=None).claimed
+    near = Fall(1.0, 0.996, 0.99, fall=0.004, ci95=(0.001, 0.01), rows=9, blocks=3)
+    assert not near.claimed
+    assert replace(near, fall=0.006).claimed
+
+
+@pytest.mark.parametrize(
+    ("held_out", "alone", "refit", "claimed"),
+    [
+        ({}, {}, False, True),
+        ({}, {"ci95": (-0.1, 0.3)}, False, False),
+        ({"ci95": (-0.1, 0.3)}, {}, False, False),
+        ({"in_fit": 0.3}, {}, False, False),
+        ({}, {"in_fit": 0.3}, False, False),
+        ({"in_fit": 0.3}, {"in_fit": 0.3}, True, True),
+        ({"in_fit": 0.3}, {"ci95": (-0.1, 0.3)}, True, False),
+        ({"ci95": (-0.1, 0.3)}, {}, True, False),
+    ],
+)
+def test_an_amendment_is_claimed_for_the_effects_and_for_the_model(held_out, alone, refit, claimed):
+    """Where the given model knew the rows, a joint fit is compared with the network alone."""
+    fall = Fall(1.2, 1.0, 0.2, fall=0.2, ci95=(0.1, 0.3), rows=9, blocks=3)
+    found = Amendment(
+        model=None,
+        effects=("creep",),
+        refitted=(),
+        parameters=(),
+        held_out=replace(fall, **held_out),
+        alone=replace(fall, **alone),
+        training=fall,
+        retuned=False,
+        tracks=(None, None),
+        seconds=0.0,
+        refit=SimpleNamespace() if refit else None,
+    )
+    assert found.claimed is claimed
 
 
 def test_the_fall_is_that_of_the_rms_distance():

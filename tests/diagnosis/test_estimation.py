@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 
 from surgisoft.diagnosis.candidates import with_effect
 from surgisoft.diagnosis.estimation import network_error
@@ -19,6 +20,8 @@ from surgisoft.diagnosis.estimation.intervals import (
     Parameter,
     beside_former,
     intervals,
+    p_value,
+    with_covariance,
 )
 from surgisoft.diagnosis.estimation.least_squares import (
     Fit,
@@ -408,6 +411,77 @@ def test_amplitudes_of_an_effect_that_is_not_there_are_no_surprise():
             layer.weight.add_(0.01 * layer.weight.std() * change)
     absent = problem_of(off, [measured_on(bare_arm())], part="training")
     assert fit_effects(absent, ["gain_mismatch"]).p_value > 0.05
+
+
+def fit_of(values, jacobian, residual, hold=0.0, prior=0.0):
+    """A fit of P values whose discrepancy takes nothing off and explains nothing."""
+    count = len(values)
+    nothing = SimpleNamespace(weighted=lambda slopes: slopes, held_out=lambda left, block: left)
+    return Fit(
+        values=np.array(values, float),
+        jacobian=np.array(jacobian, float),
+        residual=np.array(residual, float),
+        nuisance=nothing,
+        hold=hold * np.eye(count),
+        misfit=1.0,
+        prior_variance=np.full(count, prior),
+    )
+
+
+def test_the_covariance_of_values_by_hand():
+    """Four blocks of two rows pull by 1, -1, 3 and 1; a network's error by 2, twice as large as it
+    was validated; what holds the value by 0.5 with a variance of 9."""
+    jacobian, residual = np.zeros((8, 1, 3, 1)), np.zeros((8, 1, 3))
+    jacobian[:, 0, 0] = 1.0
+    residual[::2, 0, 0] = [1.0, -1.0, 3.0, 1.0]
+    block = np.repeat(np.arange(4), 2)
+    size = np.mean(np.square(residual).sum(2))
+    problem = SimpleNamespace(
+        block=block, noise_mm=np.array([0.5]), tolerance_mm=np.array([np.sqrt((size - 0.25) / 2)])
+    )
+    network = SimpleNamespace(pulls=lambda weighted: np.array([[2.0]]))
+    found = with_covariance(fit_of([1.0], jacobian, residual, 0.5, 9.0), problem, network)
+    wider = stats.t(3).ppf(0.975) / stats.norm.ppf(0.975)
+    noise = 8.0 * wider**2 * 4.0 / 3.0  # squares about the mean of 1: 0, 4, 4 and 0
+    assert found.meat.item() == pytest.approx(noise + 2.0 * 4.0 + 0.5 * 9.0 * 0.5)
+    assert found.curvature.item() == pytest.approx(8.0 + 0.5)
+    assert found.covariance.item() == pytest.approx(found.meat.item() / 8.5**2)
+    fine = SimpleNamespace(block=block, noise_mm=np.array([0.5]), tolerance_mm=np.array([9.0]))
+    least = with_covariance(fit_of([1.0], jacobian, residual), fine, network)
+    assert least.meat.item() == pytest.approx(noise + 4.0), "not less than as it was validated"
+
+
+def test_the_chance_of_amplitudes_by_hand():
+    """Wald's statistic of both values, and of the first alone, whose curvature is its own."""
+    fit = fit_of([3.0, 1.0], np.zeros((1, 1, 3, 2)), np.zeros((1, 1, 3)))
+    curvature, meat = np.array([[2.0, 1.0], [1.0, 2.0]]), np.diag([1.0, 4.0])
+    known = Fitted(fit, curvature, meat)
+    both = 49.0 / 1.0 + 25.0 / 4.0
+    assert p_value(known, np.array([True, True])) == pytest.approx(stats.chi2(2).sf(both), rel=1e-6)
+    small = Fitted(fit, curvature / 6.0, meat)
+    # All free values are degrees of freedom: the second one was chosen for the first.
+    assert p_value(small, np.array([True, False])) == pytest.approx(stats.chi2(2).sf(1.0), rel=1e-6)
+    inverse = np.array([[2.0, -1.0], [-1.0, 2.0]]) / 3.0
+    np.testing.assert_allclose(known.covariance, inverse @ meat @ inverse)
+    drawn = known.draws(20000, np.random.default_rng(0))
+    np.testing.assert_allclose(drawn.mean(0), [3.0, 1.0], atol=0.05)
+    np.testing.assert_allclose(np.cov(drawn.T), known.covariance, atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("value", "low", "high", "may"),
+    [
+        (3000.0, 1500.0, 1e6, True),
+        (3000.0, 2100.0, 1e6, False),
+        (0.05, 0.01, 0.2, True),
+        (0.05, 0.01, 0.09, False),
+        ([90.0, 3000.0], [80.0, 2100.0], [95.0, 1e6], False),
+    ],
+)
+def test_a_value_beyond_its_range_may_be_plausible_by_its_interval(value, low, high, may):
+    tau = Parameter("creep", "tau_s", value, low, high, "s", False, (0.1, 2000.0), "the library's")
+    assert tau.may_be_plausible is may
+    assert replace(tau, plausible=True).may_be_plausible
 
 
 @pytest.mark.parametrize(

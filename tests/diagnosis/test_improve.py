@@ -9,6 +9,7 @@ import pytest
 
 from surgisoft.cli import run
 from surgisoft.diagnosis import improve as loop
+from surgisoft.diagnosis.amend import Fall
 from surgisoft.diagnosis.decision import Probabilities
 from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Ranked, Verdict
 from surgisoft.diagnosis.improve import (
@@ -320,3 +321,24 @@ def test_what_is_left_is_not_what_was_just_added(rounds, left):
     found = Improvement(None, rounds, (), None, (None, None), 0.0, diagnoses=(said("x"),))
     first, *_ = [part.body for part in what_is_left(found).parts if isinstance(part, Text)]
     assert first == left
+
+
+@pytest.mark.parametrize(
+    ("rounds", "fall", "claimed"),
+    [
+        ((ADDED, QUIET), {}, True),
+        ((QUIET,), {}, False),
+        ((ADDED, QUIET), {"ci95": (-0.1, 0.3)}, False),
+        ((ADDED, QUIET), {"in_fit": 0.3}, False),
+        ((replace(ADDED, together=True), QUIET), {"in_fit": 0.3}, True),
+        ((replace(ADDED, together=True), QUIET), {"in_fit": 0.3, "ci95": (-0.1, 0.3)}, False),
+        ((replace(ADDED, together=True), QUIET), {}, True),
+    ],
+)
+def test_what_is_claimed_of_an_improvement(rounds, fall, claimed):
+    """Rows that the given model knew are no test of it, but for a network that was trained on."""
+    held_out = replace(Fall(1.2, 1.0, 0.2, 0.2, (0.1, 0.3), rows=9, blocks=3), **fall)
+    found = Improvement(None, rounds, (), held_out, (None, None), 0.0)
+    assert found.claimed is claimed
+    assert found.to_json()["claimed"] is claimed
+    assert ("error reduced from" in found.sentence) is claimed

@@ -4,14 +4,17 @@ import json
 from dataclasses import asdict, replace
 from importlib.resources import files
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from surgisoft.cli import run
-from surgisoft.diagnosis.design.isolability import isolability
+from surgisoft.diagnosis.design import next_experiment as designing
+from surgisoft.diagnosis.design.isolability import Isolability, isolability
 from surgisoft.diagnosis.design.next_experiment import (
     Pair,
+    Plan,
     Recommendation,
     likely_competing,
     make_plans,
@@ -320,3 +323,68 @@ def test_an_experiment_that_is_not_needed_says_what_else_may_be_the_matter(befor
     )
     assert f"goes from {before:.2f} to 0.99" in found.why
     assert ("both may be missing" in found.why) == told
+
+
+def planned(setting, minutes, chances):
+    """A plan with the chance of each of the three pairs of creep, line_lag and drift."""
+    names = ("creep", "line_lag", "drift")
+    confidence = np.full((3, 3), 0.5)
+    for (a, b), chance in zip(((0, 1), (0, 2), (1, 2)), chances, strict=True):
+        confidence[a, b], confidence[b, a] = chance, 0.999
+    zero = np.zeros((3, 3))
+    found = Isolability(names, np.zeros(3), zero, zero, zero, confidence, np.ones(3), minutes)
+    return Plan(setting, ("ramps", "wander"), minutes, 0.0, found)
+
+
+@pytest.mark.parametrize(
+    ("plans", "chosen"),
+    [
+        ([(10.0, 0.992), (6.0, 0.991), (12.0, 0.994)], 1),
+        ([(10.0, 0.97), (6.0, 0.95), (12.0, 0.96)], 0),
+        ([(10.0, 0.97), (6.0, 0.95), (14.0, 0.991)], 2),
+    ],
+)
+def test_the_shortest_of_sure_plans_is_recommended_or_else_the_surest(
+    arm, monkeypatch, plans, chosen
+):
+    """Sure is a plan with 0.99 for its least certain pair."""
+    settings = [AS_IT_STANDS, "short_tube", "bare_tip"]
+    made = [
+        planned(setting, minutes, (0.995, worst, 0.999))
+        for setting, (minutes, worst) in zip(settings, plans, strict=True)
+    ]
+    assert [plan.worst for plan in made] == pytest.approx([worst for _, worst in plans])
+    monkeypatch.setattr(
+        designing, "pose_question", lambda *given: SimpleNamespace(model=arm, known=None)
+    )
+    monkeypatch.setattr(designing, "make_plans", lambda *given: made)
+    found = propose(arm, ["creep", "line_lag", "drift"])
+    assert (found.setting, found.minutes) == (settings[chosen], plans[chosen][0])
+    told = {pair.effects: pair.after for pair in found.pairs}
+    assert told[("creep", "drift")] == pytest.approx(plans[chosen][1])
+    assert {pair.before for pair in found.pairs} == {0.5}
+
+
+def test_an_experiment_separates_pairs_that_it_makes_sure():
+    pairs = (Pair(("a", "b"), 0.6, 0.951), Pair(("a", "c"), 0.6, 0.949), Pair(("b", "c"), 0.7, 0.7))
+    found = Recommendation("x", Protocol("p", "settled", [[0.0]], [0]), "bench", 5.0, pairs, ())
+    assert found.separates == (("a", "b"),)
+    assert found.experiment.separates == (("a", "b"),)
+    assert "the chance to tell a from b goes from 0.60 to 0.95; 1 of 3 pairs" in found.why
+
+
+@pytest.mark.parametrize(
+    ("gains", "rivals"),
+    [
+        ({"a": 10.0, "b": 4.9, "c": 5.1, "d": 6.0}, ["a", "d", "c"]),
+        ({"a": 10.0, "b": 4.0, "c": 2.0}, ["a", "b"]),
+        ({"a": 6.0, "b": 7.0, "c": 8.0, "d": 9.0, "e": 10.0}, ["e", "d", "c", "b"]),
+    ],
+)
+def test_effects_compete_from_half_of_the_evidence_of_the_best_on(monkeypatch, gains, rivals):
+    """Each by its best form; at least two, at most four."""
+    owners = [name for name in gains for _ in range(2)]
+    values = [value - less for value in gains.values() for less in (0.0, 3.0)]
+    posed = SimpleNamespace(owners=owners, gains=np.array(values))
+    monkeypatch.setattr(designing, "pose_question", lambda *given, **more: posed)
+    assert likely_competing(SimpleNamespace(model=None)) == rivals

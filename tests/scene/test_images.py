@@ -9,9 +9,9 @@ import torch
 from surgisoft.scene import frames
 from surgisoft.scene.camera import Camera
 from surgisoft.scene.capsules import ArmShape
-from surgisoft.scene.images import BatchedRenderer, Label
+from surgisoft.scene.images import BatchedRenderer, Label, TissueMarks
 from surgisoft.scene.mesh import Body, Mesh
-from surgisoft.scene.render import Renderer
+from surgisoft.scene.render import SAMPLE_MM, Renderer
 from tests.scene.shapes import arc_points, box, lumpy
 
 PIXELS = 64
@@ -170,3 +170,64 @@ def test_a_moved_and_strained_organ_is_drawn_where_it_is(theatre):
         torch.testing.assert_close(moved.depth_mm[row], by_hand.depth_mm, rtol=1e-5, atol=1e-4)
         off = (moved.rgb[row].int() - by_hand.rgb.int()).abs().amax(-1)
         assert (off > (1, 12)[k]).double().mean() < 2e-3
+
+
+def test_depth_of_a_plane_in_a_wide_picture():
+    """The shorter side has the camera's field of view; pixels are square; corners are black."""
+    poses = seen_from((20.0, -10.0, 60.0))
+    for width, height in ((96, 64), (64, 96)):
+        x, y = (np.arange(n) + 0.5 - 0.5 * n for n in (width, height))
+        aims = np.stack((*np.meshgrid(x / FOCAL, y / FOCAL), np.ones((height, width))), -1)
+        aims = aims @ poses[0, :3, :3].numpy().T
+        expected = np.where(aims[..., 2] < 0.0, -60.0 / aims[..., 2], 0.0)
+        met = poses[0, :3, 3].numpy() + expected[..., None] * aims
+        expected *= (np.abs(met[..., :2]) <= 200.0).all(-1)
+        for round_view in (True, False):
+            renderer = BatchedRenderer([floor()], {}, CAMERA, width, height, round_view=round_view)
+            inside = np.hypot(*np.meshgrid(x, y)) <= 32.0
+            found = renderer.draw(poses).depth_mm[0, ..., 0].numpy()
+            np.testing.assert_allclose(found, expected * (inside | (not round_view)), rtol=1e-6)
+
+
+def test_labels_of_a_lesion_and_of_what_is_ablated():
+    """A pixel has the mark of the nearest sample within reach: 0.5 mm apart, two alternatives."""
+    grid = np.arange(-8.0, 8.25, 0.5)
+    points = np.stack((*np.meshgrid(grid, grid), np.zeros((33, 33))), -1).reshape(-1, 3)
+    lesion = np.stack((points[:, 0] < 0.0, points[:, 1] < 0.0))
+    marks = TissueMarks(
+        "floor", points, np.full(3, -20.0), 40.0, (1, 1, 1), np.array([0, len(points)]), lesion, 2.0
+    )
+    poses = seen_from((3.0, -4.0, 40.0), (3.0, -4.0, 40.0))
+    dose = torch.tensor(np.stack((2.0 - 0.2 * points[:, 1], 2.0 + 0.2 * points[:, 0])))
+    drawn = BatchedRenderer([floor()], {}, CAMERA, marks=marks).draw(
+        poses, dose=dose, lesion=torch.tensor([0, 1]), kinds=("segmentation", "depth")
+    )
+    aims = rays() @ poses[0, :3, :3].numpy().T
+    met = poses[0, :3, 3].numpy() - 40.0 / aims[..., 2:] * aims
+    away = np.linalg.norm(met[:, :, None, :2] - points[:, :2], axis=-1)
+    nearest, within = away.argmin(-1), away.min(-1) < SAMPLE_MM
+    sure = np.diff(np.sort(away, -1)[..., :2])[..., 0] > 1e-6
+    for b in range(2):
+        expected = np.where(within & lesion[b][nearest], Label.LESION, Label.ORGAN)
+        expected = np.where(within & (dose[b].numpy()[nearest] >= 2.0), Label.ABLATED, expected)
+        expected = np.where(in_circle(), expected, Label.NOTHING)
+        found = drawn.labels[b, ..., 0].numpy()
+        assert {Label.LESION, Label.ABLATED, Label.ORGAN} <= set(found.ravel().tolist())
+        np.testing.assert_array_equal(found[sure], expected[sure])
+
+
+def test_the_arm_that_carries_the_camera_is_labelled_as_its_own():
+    """Two bends behind its tip it comes into view again; next to the tip it is not drawn."""
+    line = torch.tensor(
+        [[-15.0, 4.0, 20.0], [25.0, -8.0, 12.0], [5.0, 40.0, 90.0], [5.0, -30.0, 70.0]]
+    )
+    renderer = BatchedRenderer([floor()], {"arm": 5.0}, CAMERA)
+    poses, arms = seen_from((5.0, -30.0, 70.0)), {"arm": line[None].double()}
+    own, other = (
+        renderer.draw(poses, arms, name, kinds=("segmentation",)).labels[0, ..., 0]
+        for name in ("arm", None)
+    )
+    assert 200 < (own == Label.OWN_ARM).sum() < 2000
+    assert not (own == Label.OTHER_ARM).any()
+    assert not (other == Label.OWN_ARM).any()
+    assert (other == Label.OTHER_ARM).sum() > (own == Label.OWN_ARM).sum()

@@ -89,6 +89,9 @@ class Ending:
     def measures(self, state):
         return {"step": state.world.steps.float()}
 
+    def rewards(self, state):
+        return {"arm": {"step": torch.ones(len(state.world.steps))}}
+
 
 def test_an_episode_that_is_over_counts_no_more(task):
     last = [3, 7, 2, 20, 99]
@@ -100,6 +103,7 @@ def test_an_episode_that_is_over_counts_no_more(task):
     assert found.steps.tolist() == expected
     assert found.terminated.tolist() == [True, True, True, True, False]
     assert found.largest("step").tolist() == expected
+    assert found.returns["arm"].tolist() == expected
     assert found.end("step").tolist() == expected
     assert found.measures["step"].isfinite().sum(1).tolist() == expected
     assert found.time_s.tolist() == pytest.approx([0.1 * end for end in expected])

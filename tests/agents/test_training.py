@@ -12,7 +12,7 @@ import pytest
 import torch
 from rsl_rl.algorithms import PPO
 
-from surgisoft.agents import selection
+from surgisoft.agents import selection, training
 from surgisoft.agents.compiled_network import CompiledNetwork
 from surgisoft.agents.distributed import Processes
 from surgisoft.agents.learned import LearnedPolicy
@@ -465,6 +465,100 @@ def test_a_time_out_is_bootstrapped_and_an_end_is_not():
     added = ppo.storage.rewards[:, :, 0] - torch.stack(rewards)
     torch.testing.assert_close(added, TINY.gamma * ppo.storage.values[:, :, 0] * marks)
     assert (added[:, marks] != 0.0).all()
+
+
+def test_returns_and_advantages_of_a_rollout_by_hand():
+    """Generalised advantages (Schulman et al. 2016, eq. 16) backwards from the critic's value of
+    the last observations, an episode's end in between; normalised over the rollout."""
+    preset = replace(TINY, gamma=0.8, lam=0.7)
+    env = JointEnv(make_task("track_circle"), preset.envs, 0, preset.action_kPa)
+    agents = make_ppo(env, preset, Processes())
+    (ppo,) = agents.values()
+    step, ends = env.step, torch.zeros(preset.envs, dtype=torch.bool)
+    ends[1::3] = True
+    count = []
+
+    def stepped(actions):
+        seen, reward, done, extras = step(actions)
+        count.append(1)
+        over = ends if len(count) == 5 else torch.zeros_like(done)
+        return seen, reward, over, extras | {"time_outs": torch.zeros_like(over)}
+
+    env.step = stepped
+    seen, _ = collect_rollout(env, agents, env.get_observations(), preset.rollout)
+    held = ppo.storage
+    value, advantage = ppo.critic(seen).detach()[:, 0], torch.zeros(preset.envs)
+    expected = []
+    for t in reversed(range(preset.rollout)):
+        goes_on = 1.0 - held.dones[t, :, 0].float()
+        change = held.rewards[t, :, 0] + 0.8 * goes_on * value - held.values[t, :, 0]
+        advantage = change + 0.8 * 0.7 * goes_on * advantage
+        value = held.values[t, :, 0]
+        expected.append(advantage + value)
+    expected = torch.stack(expected[::-1])
+    assert held.dones.sum() == ends.sum() > 1
+    torch.testing.assert_close(held.returns[:, :, 0], expected, rtol=1e-4, atol=1e-5)
+    raw = expected - held.values[:, :, 0]
+    torch.testing.assert_close(
+        held.advantages[:, :, 0], (raw - raw.mean()) / raw.std(), rtol=1e-3, atol=1e-4
+    )
+
+
+def test_means_of_a_rollout_leave_out_what_does_not_apply():
+    """Four of 64 steps end an episode; a measure applies in every other one, another never."""
+    env = JointEnv(make_task("track_circle"), TINY.envs, 0, TINY.action_kPa)
+    agents = make_ppo(env, TINY, Processes())
+    step, count = env.step, []
+    half = torch.where(torch.arange(TINY.envs) % 2 == 0, 3.0, torch.nan)
+
+    def stepped(actions):
+        seen, _, _, extras = step(actions)
+        count.append(1)
+        over = (torch.arange(TINY.envs) < 4) & (len(count) == 3)
+        measures = {"half": half, "never": torch.full_like(half, torch.nan)}
+        terms = {"arm": {"one": torch.ones(TINY.envs), "two": 2.0 * torch.ones(TINY.envs)}}
+        return seen, {"arm": 3.0 + half.nan_to_num()}, over, extras | {
+            "measures": measures, "terms": terms
+        }  # fmt: skip
+
+    env.step = stepped
+    _, found = collect_rollout(env, agents, env.get_observations(), TINY.rollout)
+    assert found.episodes == 4
+    assert found.rewards == {"arm": pytest.approx(4.5)}
+    assert found.terms == {"arm/one": 1.0, "arm/two": 2.0}
+    assert found.measures == {"half": 3.0, "never": pytest.approx(float("nan"), nan_ok=True)}
+
+
+def test_a_new_policy_asks_for_next_to_nothing():
+    env = JointEnv(make_task("track_circle"), TINY.envs, 0, TINY.action_kPa)
+    (ppo,) = make_ppo(env, TINY, Processes()).values()
+    first = ppo.get_policy()(env.get_observations()).detach()
+    assert 0.0 < first.abs().max() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("steps", "minutes", "share"),
+    [(100, 2.0, 0.75), (40, 2.0, 0.75), (20, 2.0, 1.0), (100, None, 0.3), (None, 2.0, 0.75)],
+)
+def test_a_training_ends_by_its_steps_or_by_its_minutes(steps, minutes, share):
+    """30 steps in 90 s."""
+    assert replace(plan_of(), steps=steps, minutes=minutes).share(30, 90.0) == pytest.approx(share)
+
+
+def test_checkpoints_are_evaluated_as_they_act(tmp_path, monkeypatch):
+    """With the preset's change of pressure for an output of 1, and the pumps' limit."""
+    seen = []
+
+    def evaluated(task, policy, episodes):
+        seen.append((policy.actors["arm"].scale, policy.actors["arm"].limit, episodes))
+        return {"error_mm": 1.0}, None
+
+    monkeypatch.setattr(training, "evaluate_checkpoint", evaluated)
+    monkeypatch.setattr(training, "save_episode", lambda log, path: None)
+    plan = plan_of(turns=1, preset=replace(TINY, action_kPa=0.3))
+    trained(tmp_path / "run", plan)
+    limit = make_task(plan.task).world.arms["arm"].pneumatics.step_kPa
+    assert seen == [(0.3, limit, TINY.evaluation_episodes)]
 
 
 def test_the_better_checkpoint_is_kept():

@@ -19,6 +19,7 @@ from surgisoft.surrogate.interval import (
     ErrorInterval,
     calibrate,
     coverage_of,
+    distance_across,
     distance_to,
     group_factor,
     group_quantiles,
@@ -198,6 +199,42 @@ def test_too_few_rows_calibrate_nothing():
     hidden = gaussian(300, 0)
     hidden[:250, 1] = torch.nan
     assert calibrate(hidden, torch.zeros(300), torch.zeros(300), "s") is None
+
+
+def test_between_stored_coverages_by_hand():
+    """Logarithms of quantiles over those of the share outside; beyond the stored ones the nearest,
+    and near the training the radius of the nearest scored row."""
+    known = ErrorInterval((0.5, 0.95), ((0.1, 0.2), (0.4, 0.6)), (2.0, 0.0), 500, 7, "s", 0.3)
+    share = (math.log(0.5) - math.log(0.2)) / (math.log(0.5) - math.log(0.05))
+    middle = [0.1 ** (1 - share) * 0.4**share, 0.2 ** (1 - share) * 0.6**share]
+    for coverage, quantiles in ((0.8, middle), (0.95, [0.4, 0.6]), (0.2, [0.1, 0.2])):
+        for distance, factor in ((0.3, 1.6), (0.1, 1.6), (1.0, 3.0)):
+            found = known.radius_mm(torch.tensor([distance], dtype=torch.float64), coverage)[0]
+            assert found.tolist() == pytest.approx([factor * quantiles[0], quantiles[1]])
+    assert known.radius_mm(torch.zeros(1, dtype=torch.float64), 0.999)[0, 1] == pytest.approx(0.6)
+    wider = known.scaled([2.0, 0.5])
+    assert wider.quantiles_mm == (
+        (pytest.approx(0.2), pytest.approx(0.1)),
+        (pytest.approx(0.8), pytest.approx(0.3)),
+    )
+
+
+def test_a_quantile_counts_the_row_that_comes_next():
+    """Of 100 scores 0.95 (100 + 1) are below the 96th; missing ones are no scores."""
+    scores = torch.cat((torch.arange(100.0) + 1.0, torch.full((50,), torch.nan)))[:, None]
+    assert group_quantiles(scores, torch.zeros(150), 0.95).tolist() == [96.0]
+    assert group_quantiles(scores, torch.zeros(150), 0.999).tolist() == [100.0]
+    error, radius = torch.tensor([0.5, 1.0, 2.0, torch.nan]), torch.ones(4)
+    assert coverage_of(error, radius) == pytest.approx(2.0 / 3.0)
+
+
+def test_the_distance_of_a_left_out_row_is_that_to_other_folds():
+    """In ranges of 10; the rows of a row's own fold are nearer."""
+    actuation = torch.tensor([[0.0], [1.0], [5.0], [6.0]])
+    found = distance_across(actuation, torch.tensor([0, 0, 1, 1]), torch.tensor([10.0]))
+    assert found.tolist() == pytest.approx([0.5, 0.4, 0.4, 0.5])
+    alone = distance_across(actuation, torch.zeros(4), torch.tensor([10.0]))
+    assert alone.tolist() == [0.0] * 4
 
 
 def test_distance_is_in_ranges_of_the_chambers():

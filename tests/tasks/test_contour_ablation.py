@@ -10,6 +10,7 @@ from surgisoft.errors import InputError
 from surgisoft.scene.spec import ContourSpec
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.contour_ablation import ContourAblation, ContourAblationConfig
+from surgisoft.tasks.laser_work import RELEASED
 from surgisoft.tasks.trajectories.routes import draw_route
 from surgisoft.tasks.world.random_streams import streams
 from surgisoft.tasks.world.treatment import Stretch
@@ -105,6 +106,29 @@ def test_the_seam_of_a_closed_contour_is_cut_over_2_mm():
     assert route.shape == (3, stretch.count + 8)
     assert torch.equal(route[:, :8], route[:, -8:])
     assert all(len(set(row[8:])) == stretch.count for row in route.tolist())
+
+
+def test_between_two_contours_the_reference_leaps_and_the_beam_is_off(task, monkeypatch):
+    """24 mm apart, and once more where the route begins again; a step along a contour is 0.4 mm."""
+    monkeypatch.setattr(task, "released", lambda state: torch.ones_like(state.goal.fired))
+    steps = sum(stretch.count for stretch in task.scene.stretches)
+    state = Episodes(task).seeded(0, steps)
+    state = replace(state, goal=replace(state.goal, done=torch.arange(steps)))
+    ends = torch.zeros(steps, dtype=torch.bool)
+    ends[task.scene.stretches[0].count - 1] = ends[-1] = True
+    assert torch.equal(task.leaps(state), ends)
+    assert torch.equal(task.fires(state), ~ends)
+    still = {name: torch.zeros(steps, 3) for name in task.agents}
+    after = task.advance(state, still)
+    assert torch.equal(after.goal.fired, ~ends)
+    assert torch.equal(after.goal.done, state.goal.done + 1), "it moves on without the beam"
+    one = Episodes(task).seeded(0, 1)
+    for done, on in ((0, True), (task.scene.stretches[0].count - 1, False)):
+        for released in (1.0, 0.0):
+            placed = replace(one, goal=replace(one.goal, done=torch.tensor([done])))
+            then = task.advance_measured(placed, {RELEASED.name: torch.tensor([released])}).goal
+            assert then.fired.tolist() == [bool(released) and on]
+            assert then.done.tolist() == [done + round(released)]
 
 
 def test_burnt_areas_are_told_by_their_zones(task):

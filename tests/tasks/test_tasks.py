@@ -32,7 +32,15 @@ from surgisoft.tasks.registry import (
 )
 from surgisoft.tasks.track import TrackConfig, track_circle
 from surgisoft.tasks.track_body import TrackBody, TrackBodyConfig
-from surgisoft.tasks.trajectories.closed_path import circle, square
+from surgisoft.tasks.trajectories.closed_path import (
+    RingCut,
+    Traversal,
+    circle,
+    draw_cut,
+    draw_traversal,
+    point_on_closed,
+    square,
+)
 from surgisoft.tasks.world.arm import Randomisation
 from surgisoft.tasks.world.pytree import ObjectBatch, rows, tree_map, with_rows
 from surgisoft.tasks.world.random_streams import streams
@@ -273,6 +281,41 @@ def test_reward_and_errors_of_a_body_by_hand():
     assert terms["fine"].item() == pytest.approx(math.exp(-mean / 0.1), rel=1e-3)
     assert measures["error_mm"].item() == pytest.approx(mean, rel=1e-4)
     assert measures["tip_mm"].item() == pytest.approx(0.1 * count, rel=1e-4)
+
+
+def test_where_a_reference_is_on_its_path_by_hand():
+    """It waits for 5 steps and goes round in 20; a cut goes on where the beam was on, in 10."""
+    start, direction = torch.tensor([0.25, 0.25]), torch.tensor([1.0, -1.0])
+    traversal = Traversal(start, direction)
+    for step, moved in ((0, 0.0), (5, 0.0), (6, 0.05), (15, 0.5), (25, 1.0)):
+        found = traversal.share(torch.full((2,), step), 5, 20)
+        np.testing.assert_allclose(found, [0.25 + moved, 0.25 - moved], atol=1e-6)
+    cut = RingCut(start, direction, torch.tensor([3, 3]), torch.zeros(2, dtype=torch.bool))
+    np.testing.assert_allclose(cut.share(10), [0.55, -0.05], atol=1e-6)
+    np.testing.assert_allclose(cut.share(10, 2), [0.75, -0.25], atol=1e-6)
+    on = torch.tensor([True, False])
+    after = cut.after(on)
+    assert after.done.tolist() == [4, 3]
+    assert torch.equal(after.fired, on)
+    stream = streams(0, 300)
+    _, fixed = draw_traversal(stream, False)
+    assert set(fixed.start.tolist()) == {0.0}
+    assert set(fixed.direction.tolist()) == {1.0}
+    for drawn in (draw_traversal(stream, True)[1], draw_cut(stream)[1]):
+        assert 0.4 < drawn.start.mean() < 0.6
+        assert 100 < (drawn.direction > 0.0).sum() < 200
+        assert set(drawn.direction.tolist()) == {1.0, -1.0}
+
+
+def test_a_point_on_a_closed_path_by_hand():
+    """A square of 4 corners 2 mm apart, and one at 10 mm: halves lie between corners, ends meet."""
+    square_mm = torch.tensor([[0.0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]])
+    paths = torch.stack((square_mm, square_mm + 10.0))
+    which = torch.tensor([0, 0, 0, 1, 0, 0])
+    share = torch.tensor([0.0, 0.125, 0.875, 0.25, 1.25, -0.125])
+    found = point_on_closed(paths, which, share)
+    expected = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [12, 10, 10], [2, 0, 0], [0, 1, 0]]
+    np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
 def test_paths_by_hand():

@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surgisoft.diagnosis.residuals import fit_of_model
+from surgisoft.diagnosis.residuals import ModelFit, fit_of_model
 from surgisoft.errors import InputError
 from surgisoft.surrogate.checkpoint import default_arm
+from surgisoft.surrogate.model import Validation
 from tests.diagnosis.setup.recordings import NOISE_MM, measured, predicted, with_points
+from tests.diagnosis.synthetic import recording, still_model, walk
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +36,31 @@ def test_a_model_of_this_arm_predicts_most_of_its_motion(model, share, fits):
     found = fit_of_model(model, [away])
     assert found.rmse_mm == pytest.approx(share * motion, rel=1e-3)
     assert found.fits is fits
+
+
+@pytest.mark.parametrize(
+    ("rmse_mm", "motion_mm", "fits"),
+    [
+        (1.4, 3.0, True),
+        (1.6, 3.0, False),
+        (3.4, 10.0, True),
+        (3.6, 10.0, False),
+        (9.0, 1.4, True),
+        (9.0, 1.6, False),
+    ],
+)
+def test_a_model_fits_with_35_percent_of_the_motion_or_with_half_more_than_its_error(
+    rmse_mm, motion_mm, fits
+):
+    """An error of 1 mm is expected; below 1.5 mm of motion nothing shows."""
+    assert ModelFit(rmse_mm, 1.0, motion_mm).fits is fits
+
+
+def test_the_expected_error_is_that_of_the_model_and_the_noise_together():
+    model = still_model()
+    model.validation = Validation(5.0, (3.0, 4.0, 5.0), 100, noise_mm=0.0)
+    found = fit_of_model(model, [recording(np.zeros(400), walk(400), noise_mm=2.0)])
+    assert found.expected_mm == pytest.approx(np.sqrt(3 * 2.0**2 + (9 + 16 + 25) / 3))
 
 
 def test_an_arm_that_does_not_move_shows_nothing(model):

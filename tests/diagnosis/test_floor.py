@@ -50,6 +50,21 @@ def test_nothing_that_came_once_is_a_repeat():
         assert repeats(still_model(pressure.shape[1]), [made]).rmse_mm is None
 
 
+def test_a_repeat_in_another_run_counts_whatever_its_clock_shows():
+    """Six runs whose clocks all begin at 0: a row repeats one of the same time in another run."""
+    run = np.repeat(np.arange(6), 300)
+    made = recording(np.zeros(1800), np.tile(CYCLE, (6, 1)), run=run, noise_mm=None)
+    made = replace(made, t_s=np.tile(made.t_s[:300], 6))
+    assert repeats(still_model(), [made]).rmse_mm == pytest.approx(FLOOR, rel=0.05)
+
+
+@pytest.mark.parametrize(("blocks", "source"), [(4, "unknown"), (6, "repeats")])
+def test_repeats_have_to_lie_in_five_blocks_of_time(blocks, source):
+    made = recording(np.zeros(1800), np.tile(CYCLE, (6, 1)), noise_mm=None)
+    table = residual_table(still_model(), [made])
+    assert repeat_floor(table, np.arange(1800) * blocks // 1800).source == source
+
+
 def test_a_statement_of_the_lab_comes_first():
     made = recording(np.zeros(600), walk(600), noise_mm=0.2)
     floor = residual_table(still_model(), [made]).floor

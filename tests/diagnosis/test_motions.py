@@ -94,6 +94,22 @@ def test_copies_are_left_out_of_a_fit_together():
     assert len(set(folds(np.zeros(12, int)))) >= 2
 
 
+def test_neighbouring_motions_are_left_out_together_where_there_are_ten_of_them():
+    assert folds(np.arange(12)).tolist() == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 0, 0]
+    assert folds(np.arange(9)).tolist() == [0, 1, 2, 3, 4, 0, 1, 2, 3]
+    assert folds(np.zeros(12, int)).tolist() == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 0, 0]
+
+
+def test_a_rest_repeats_no_motion():
+    """Two rests at the same actuation; and a sweep with a rest that is longer than it."""
+    rest = np.tile([3.0, 4.0], (200, 1))
+    assert motions(path(np.tile(rest, (2, 1))), HALF, np.arange(400) // 200).tolist() == [0, 1]
+    once = sweep(1.0, 1)
+    held = np.concatenate([once, np.tile(once[:1], (3 * len(once), 1))])
+    block = np.repeat([0, 1], len(held))
+    assert motions(path(np.tile(held, (2, 1))), HALF, block).tolist() == [0, 1]
+
+
 def test_repetitions_of_six_motions_count_as_six_independent_samples():
     """Gains of one sign in six motions: one in 2^6 by chance, not one in 2^96 for their copies."""
     rows = sweep(1.0, 16)

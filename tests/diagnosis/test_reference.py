@@ -7,6 +7,7 @@ import torch
 from surgisoft.cli import run
 from surgisoft.diagnosis.cross_validation import FITTED
 from surgisoft.diagnosis.diagnose import diagnose
+from surgisoft.diagnosis.residuals import problem_of
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.surrogate.checkpoint import save_model
 from surgisoft.surrogate.model import Validation
@@ -50,6 +51,15 @@ def test_what_has_changed_is_named(model):
     assert since.verdict.confidence > alone.probabilities.effects["misalignment"] + 0.1
     gain = {row.effect: row.gain_alone for row in since.ranking}["misalignment"]
     assert gain > 0.8
+
+
+def test_a_reference_is_scaled_as_the_rows_in_question_are(model):
+    """From -1 to 1 over the range of the actuation, 0 to 10; residuals in mm as measured."""
+    before = recording(np.zeros(500), walk(500, seed=2), POINTS + 3.0, seed=2)
+    problem = problem_of(model, [measured(1)]).with_reference([before])
+    np.testing.assert_allclose(problem.reference.pressure, before.measured / 5 - 1, atol=1e-6)
+    np.testing.assert_allclose(problem.reference.residual, before.key_points_mm - POINTS, atol=1e-4)
+    np.testing.assert_array_equal(np.unique(problem.reference.direction), [-1, 1])
 
 
 def test_rows_of_a_reference_are_fitted_and_not_judged():

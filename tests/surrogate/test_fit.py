@@ -9,15 +9,18 @@ import pytest
 import torch
 
 from surgisoft.errors import InputError
+from surgisoft.surrogate import ensemble
 from surgisoft.surrogate.effects import hypothesis_of
 from surgisoft.surrogate.effects.twist import Twist
 from surgisoft.surrogate.fit import FitConfig, excitation, fit
 from surgisoft.surrogate.history import pack
-from surgisoft.surrogate.interval import coverage_of
+from surgisoft.surrogate.interval import calibrate, coverage_of
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import HawEnsemble, HawNN, range_weights, weighted_mse
 from surgisoft.surrogate.training import (
     Data,
+    dealt,
+    hold_out,
     make_rows,
     model_rows,
     normalise,
@@ -130,6 +133,37 @@ def test_a_block_of_rows_ends_with_its_run():
     block = make_rows(model, runs).block
     assert block.bincount().tolist() == [25, 25, 10, 25, 5]
     assert (block.diff() >= 0).all()
+
+
+def still_runs(*lengths):
+    """Runs of so many rows of an arm that rests, each two key points."""
+    return pack(
+        [torch.arange(float(count)) for count in lengths],
+        [torch.zeros(count, 3) for count in lengths],
+        [torch.zeros(count, 2, 3) for count in lengths],
+    )
+
+
+def test_a_fifth_of_the_runs_is_held_out_or_a_fifth_of_each_of_few():
+    """Two of ten runs as a whole; four of twenty blocks of each of four runs, of 100 or 60 rows."""
+    ten = still_runs(*range(20, 30))
+    held = hold_out(ten, 0)
+    assert not (held & ~ten.valid).any()
+    whole = (held.sum(1) == ten.valid.sum(1)).tolist()
+    assert sum(whole) == 2
+    assert held.any(1).tolist() == whole
+    assert not torch.equal(held, hold_out(ten, 1))
+    assert torch.equal(held, hold_out(ten, 0))
+    assert dealt(ten).tolist() == [k for k, count in enumerate(range(20, 30)) for _ in range(count)]
+    few = still_runs(100, 60, 100, 100)
+    held = hold_out(few, 0)
+    assert held.sum(1).tolist() == [20, 12, 20, 20]
+    for run, rows in enumerate((5, 3, 5, 5)):
+        blocks = held[run, : 20 * rows].view(20, rows)
+        assert torch.equal(blocks.all(1), blocks.any(1))
+    group = dealt(few)
+    assert group.tolist() == [20 * run + i // rows for run, rows in enumerate((5, 3, 5, 5))
+                              for i in range(20 * rows)]  # fmt: skip
 
 
 def test_the_validated_error_counts_every_measured_key_point_once():
@@ -298,14 +332,23 @@ def runs(seeds, length: int = 150, hysteresis: float = 0.0):
 SMALL = FitConfig(hidden=(32, 32), epochs=60, inputs="pressure", batch=128, prior="none")
 
 
-def test_an_ensemble_knows_its_error_on_runs_that_took_no_part():
+def test_an_ensemble_knows_its_error_on_runs_that_took_no_part(monkeypatch):
     train, fresh = runs(range(12), length=40), runs(range(50, 62))
+    given = []
+
+    def recorded(error, distance, group, source):
+        given.append(distance)
+        return calibrate(error, distance, group, source)
+
+    monkeypatch.setattr(ensemble, "calibrate", recorded)
     result = fit(train, None, SPEC, replace(SMALL, members=4, learning_rate=1e-2))
     assert isinstance(result.model.network, HawEnsemble)
     interval = result.model.validation.interval
     assert interval.source == "cross-validation"
     assert interval.groups == 10, "two of twelve runs are held out"
     assert interval.rows == 400
+    (distance,) = given
+    assert 0.01 < float(distance.median()) < 0.3, "in ranges of a chamber, to rows of other runs"
     found = result.model.predict_interval(fresh)
     error = (found.key_points_mm - fresh.key_points).norm(dim=-1)
     assert 0.91 <= coverage_of(error, found.radius_mm) <= 0.985

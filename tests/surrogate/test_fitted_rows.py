@@ -73,6 +73,33 @@ def test_rows_that_only_chose_the_model_are_not_called_fitted(pair):
     assert FittedRows.from_json(values) == trained
 
 
+def test_rows_with_several_uses_count_once(pair):
+    """For the network before the choice of the model, and for that before the effects."""
+    first, other = (history_of([each]) for each in pair)
+    trained, chose = FittedRows.of([first]), FittedRows.of([other], "chosen")
+    amended = FittedRows.of([first, other], "amended")
+    for both in (trained.joined(amended).joined(chose), chose.joined(trained).joined(amended)):
+        assert both.uses_of(first) == {"fitted": 1.0, "chosen": 0.0, "amended": 0.0}
+        assert both.uses_of(other) == {"fitted": 0.0, "chosen": 1.0, "amended": 0.0}
+
+
+def test_a_record_without_the_rows_of_the_first_fit_stays_incomplete(pair):
+    first, other = (history_of([each]) for each in pair)
+    part, whole = FittedRows.of([first]).joined(None), FittedRows.of([first])
+    assert not part.complete
+    assert not part.joined(whole).complete
+    assert not whole.joined(part).complete
+    assert part.certain_part_of(other) is None, "they may have been among those not recorded"
+    assert whole.certain_part_of(other) == 0.0
+
+
+def test_the_same_shape_under_another_actuation_is_another_row(pair):
+    """A row is what was actuated and what was measured."""
+    first = history_of([pair[0]])
+    other = replace(first, pressure=first.pressure + 0.01)
+    assert FittedRows.of([first]).share_of(other) == 0.0
+
+
 def test_the_rows_that_effects_were_fitted_to_are_counted_as_they_are(pair, model):
     """`amend` fits to the rows that are not held out, and to all of them: no estimate is needed."""
     fresh = amend(model, [pair[1]], "gain_mismatch", False, refit="never").model

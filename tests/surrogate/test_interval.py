@@ -194,6 +194,20 @@ def test_runs_that_are_alike_leave_the_interval_as_it_is():
     assert group_factor(error, torch.zeros(4000), LEVEL) == 1.0
 
 
+def test_a_wider_coverage_never_has_the_smaller_radius():
+    """Of two runs the medians differ tenfold and the highest errors do not: the median of all, 10,
+    counts ten times, the 95 % quantile of all, 10 as well, once."""
+    alike, mixed = torch.full((200, 1), 10.0), torch.ones(200, 1)
+    mixed[120:] = 10.0
+    error, run = torch.cat([alike, mixed]).double(), torch.arange(400) // 200
+    assert group_factor(error, run, 0.5) == pytest.approx(10.0)
+    assert group_factor(error, run, 0.95) == pytest.approx(1.0)
+    found = calibrate(error, torch.zeros(400), run, "s")
+    for level in (0.5, 0.95):
+        radius = found.radius_mm(torch.zeros(1, dtype=torch.float64), level)
+        assert float(radius) == pytest.approx(100.0)
+
+
 def test_too_few_rows_calibrate_nothing():
     assert calibrate(gaussian(99, 0), torch.zeros(99), torch.zeros(99), "s") is None
     hidden = gaussian(300, 0)

@@ -10,6 +10,7 @@ from surgisoft.surrogate.networks import (
     ConstantCurvature,
     HawEnsemble,
     HawNN,
+    KernelArm,
     arc_point,
     arc_rotation,
     parse_widths,
@@ -120,6 +121,51 @@ def test_an_ensemble_is_the_mean_of_its_members():
     other = torch.rand(3, 7, 3) * 60 - 10, torch.randn(3, 7, 3).sign()
     apart = torch.stack([network(*(x[k] for x in other)) for k, network in enumerate(networks)])
     assert torch.allclose(ensemble.members_at(*other), apart, atol=1e-5)
+
+
+def test_an_ensemble_has_no_direction_of_a_chamber_that_its_members_have_none_of():
+    networks = [made(seed) for seed in range(3)]
+    for network in networks:
+        network.use.copy_(torch.tensor([1.0, 0.0, 1.0]))
+    ensemble = HawEnsemble.of(networks)
+    pressure, direction = torch.rand(20, 3) * 60 - 10, torch.randn(20, 3).sign()
+    expected = torch.stack([network(pressure, direction) for network in networks])
+    assert torch.allclose(ensemble.each(pressure, direction), expected, atol=1e-5)
+    flipped = direction * torch.tensor([1.0, -1.0, 1.0])
+    assert torch.equal(ensemble(pressure, direction), ensemble(pressure, flipped))
+    three = [torch.stack([x] * 3) for x in (pressure, flipped)]
+    assert torch.allclose(ensemble.members_at(*three), expected, atol=1e-5)
+
+
+def test_a_section_stretches_by_its_exponential_and_bends_by_its_pressures():
+    """A factor of 1.2 in all at no pressure; at full pressure of chamber 2 by 1.5 more."""
+    model = ConstantCurvature(LOW, HIGH, 3, 1)
+    model.set_rest(torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 35.0], [0.0, 0.0, 70.0]]))
+    with torch.no_grad():
+        model.table[0, 2, -1], model.table[0, 2, 1] = math.log(1.2), math.log(1.5)
+        model.table[0, 1, 0] = 0.4
+    middle = (LOW + HIGH) / 2.0
+    stretched, bent = middle.clone(), middle.clone()
+    stretched[1], bent[0] = HIGH[1], LOW[0]
+    points = model(torch.stack((middle, stretched, bent)), torch.zeros(3, 3))
+    assert torch.allclose(points[0, :, 2], 1.2 * torch.tensor([0.0, 35.0, 70.0]), atol=1e-3)
+    assert torch.allclose(points[1, :, 2], 1.8 * torch.tensor([0.0, 35.0, 70.0]), atol=1e-3)
+    expected = arc_point(torch.tensor([0.0, -0.4]), torch.tensor(84.0))
+    assert torch.allclose(points[2, -1], expected, atol=1e-3)
+
+
+def test_inputs_of_kernel_regression_by_hand():
+    """Pressures in half ranges from the middle, and how far they are ahead of their low passes:
+    fitted models hold places of these."""
+    kernel = KernelArm(torch.zeros(2), torch.tensor([20.0, 40.0]), 3, 2, 4, times_s=(0.5, 2.0))
+    pressure = torch.tensor([[15.0, 10.0]])
+    memory = torch.tensor([[[10.0, 5.0], [10.0, 30.0]]])
+    found = kernel.inputs(pressure, memory)[0].tolist()
+    assert found == pytest.approx([0.5, -0.5, 0.5, 1.0, 0.0, -1.0])
+    assert kernel.inputs(pressure)[0].tolist() == pytest.approx([0.5, -0.5, 0.0, 0.0, 0.0, 0.0])
+    held = kernel.advance(memory, pressure, pressure, torch.tensor([0.5]))
+    keep = torch.tensor([math.exp(-1.0), math.exp(-0.25)])
+    assert torch.allclose(held, pressure[..., None] + keep * (memory - pressure[..., None]))
 
 
 def test_what_was_not_measured_does_not_count():

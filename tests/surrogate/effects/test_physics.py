@@ -263,6 +263,22 @@ def test_gains_and_coupling_by_hand():
     )
 
 
+@pytest.mark.parametrize(
+    ("name", "options", "memory"),
+    [
+        ("gain_mismatch", {}, ()),
+        ("drift", {"kind": "actuation"}, (600.0,)),
+        ("drift", {"kind": "temperature"}, (10.0,)),
+    ],
+)
+def test_gains_leave_the_actuation_at_rest_as_it_is(name, options, memory):
+    """An arm that rests at 20 kPa of 10 to 50, 20 % more gain: 20 stays, 30 becomes 32, 10 is 8."""
+    resting = replace(RANGE, low=torch.full((3,), 10.0), rest=torch.full((3,), 20.0))
+    effect = with_strength(make_effect(name, resting, **options), gain=0.2)
+    answer = effect.apply(torch.tensor([[20.0, 30.0, 10.0]]), torch.tensor([memory]))
+    assert answer[0].tolist() == pytest.approx([20.0, 32.0, 8.0])
+
+
 def test_pairs_couple_one_way_each():
     """The quadratic losses come row by row: chamber 1 by 2, 1 by 3, 2 by 1, ..."""
     losses = [0.1, 0.0, 0.3, 0.0, 0.0, 0.5]
@@ -442,6 +458,15 @@ def test_twist_moves_a_bent_arm_out_of_its_plane_by_the_area_under_it():
     assert abs(float(answer[-1, 1])) == pytest.approx(0.1 * 2 * area / twist_length(), rel=0.01)
     assert float(answer[:, [0, 2]].abs().max()) < 1e-4
     assert torch.allclose(pose(twist, STRAIGHT_13, torch.ones(1, 1)), STRAIGHT_13)
+
+
+def test_twist_by_a_suction_is_the_opposite_of_that_by_a_pressure():
+    """Of both parts, the one that grows with the square of the load too."""
+    for part in ("linear", "quadratic"):
+        twist = with_strength(make_effect("twist", arm(QUARTER)), **{part: 0.1})
+        pushed, drawn = (pose(twist, QUARTER, torch.tensor([[x]])) - QUARTER for x in (0.5, -0.5))
+        assert torch.allclose(drawn, -pushed, atol=1e-4)
+        assert float(pushed.abs().max()) > 0.1
 
 
 def test_what_weight_bends_keeps_its_plane_when_the_body_is_twisted():

@@ -40,6 +40,7 @@ from surgisoft.measurement.protocols import SIGNALS, Protocol, load_schedule, ma
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm
+from tests.diagnosis.setup.recordings import measured
 
 
 @pytest.fixture(scope="module")
@@ -149,6 +150,36 @@ def test_rivals_of_a_lag_are_found_and_a_change_of_the_bench_settles_them(proble
     left = recommend(problem, ["line_lag", "rate_dependence"], settings=(AS_IT_STANDS,))
     assert left.setting == AS_IT_STANDS
     assert left.pairs[0].after < pair.after
+
+
+def lag_share(problem) -> float:
+    """Share of a line lag that recordings show, beside creep."""
+    question = pose_question(problem.model, problem, ["line_lag", "creep"])
+    (place,) = (k for k, j in enumerate(question.draws.form) if question.owners[j] == "line_lag")
+    return float(np.abs(question.draws.amplitudes[:, place]).max())
+
+
+def test_a_key_point_that_was_never_measured_says_nothing(arm, lagging, problem):
+    """Not that it stood where the model predicts it: the lag is as strong as without that point."""
+    points = lagging.key_points_mm.copy()
+    points[:, -1] = np.nan
+    shown = lag_share(problem_of(arm, [replace(lagging, key_points_mm=points)]))
+    assert shown == pytest.approx(lag_share(problem), rel=0.07)
+
+
+def test_a_recording_that_shows_no_effect_speaks_against_each_of_them(arm):
+    """Its evidence is below 0, and amplitudes are then not taken from it: several may be true."""
+    question = pose_question(arm, problem_of(arm, [measured(1200)]), ["line_lag", "creep"])
+    assert (question.gains < 0).all()
+    assert len(question.draws.form) > 4
+
+
+def test_an_experiment_has_two_runs_however_sure_one_is(arm):
+    limits = limits_within(arm.spec.low, arm.spec.high)
+    question = pose_question(arm, None, ["misalignment", "line_lag"])
+    (plan,) = make_plans(question, limits, 15.0, (AS_IT_STANDS,))
+    assert len(plan.figures) == 2
+    assert plan.minutes == bench_minutes(2)
 
 
 def lead(problem, true: str, rival: str) -> float:

@@ -157,10 +157,10 @@ def pose_question(
     else:
         progress(1, QUESTION_STEPS, "sensitivities on the recordings")
         dt, noise = sample_time(problem.history), problem.noise_mm
-        design, residual = _thinned(problem)
+        design, residual, seen = _thinned(problem)
         sensitivities = sensitivities_on(design, sizes.forms)
         uncertainty = uncertainty_of(model, noise, sizes.profile_mm, dt)
-        gram = _with(residual, design, sensitivities, uncertainty).gram()
+        gram = _with(residual, seen, design, sensitivities, uncertainty).gram()
         fitted, gains = _fitted(gram, sizes)
         progress(2, QUESTION_STEPS, "fits of the effects")
         sharp = _sharp(problem, sizes, fitted, gains) if competing else []
@@ -168,7 +168,7 @@ def pose_question(
         if sharp:
             sizes = Sizes.of(reference, sensitivities_on(reference, forms + sharp), forms + sharp)
             sensitivities += sensitivities_on(design, sizes.forms[len(sensitivities) :])
-            gram = _with(residual, design, sensitivities, uncertainty).gram()
+            gram = _with(residual, seen, design, sensitivities, uncertainty).gram()
             fitted, gains = _fitted(gram, sizes)
         best = int(np.argmax(gains))
         rms = float(np.sqrt(3.0 * np.mean((sensitivities[best] @ fitted[best]) ** 2)))
@@ -177,7 +177,7 @@ def pose_question(
         sizes, sensitivities = sizes.select(kept), [sensitivities[j] for j in kept]
         scale = max(WEAKEST, rms / sizes.plausible_mm)
         uncertainty = uncertainty_of(model, noise, scale * sizes.profile_mm, dt)
-        known = _with(residual, design, sensitivities, uncertainty)
+        known = _with(residual, seen, design, sensitivities, uncertainty)
         gram = known.gram()
         fitted, gains = _fitted(gram, sizes)
         misfit = _misfit(gram, sizes, fitted, gains)
@@ -223,13 +223,18 @@ def _best_of_each(sizes: Sizes, gains: np.ndarray) -> list[int]:
     return sorted(kept)
 
 
-def _with(residual, design: Design, sensitivities, uncertainty: Uncertainty) -> Moments:
-    """Moments of the sensitivities, with the residual (S, n, 3) as the last one."""
-    return moments_of(design, [*sensitivities, residual[..., None]], uncertainty)
+def _with(residual, seen, design: Design, sensitivities, uncertainty: Uncertainty) -> Moments:
+    """Moments of the sensitivities, with the residual (S, n, 3) as the last one.
+
+    seen: (n,) bool, the key points that were measured; the others say nothing.
+    """
+    columns = [each * seen[:, None, None] for each in (*sensitivities, residual[..., None])]
+    return moments_of(design, columns, uncertainty)
 
 
-def _thinned(problem: Problem) -> tuple[Design, np.ndarray]:
-    """A problem's rows as a design, and their residual (S, n, 3) in mm, all key points seen."""
+def _thinned(problem: Problem) -> tuple[Design, np.ndarray, np.ndarray]:
+    """A problem's rows as a design, their residual (S, n, 3) in mm, and which key points (n,) were
+    measured: not those that are missing in most rows, whose residual is 0."""
     residual = problem.residual
     known = np.isfinite(residual).all(2)
     often = known.mean(0) >= 0.5
@@ -246,7 +251,7 @@ def _thinned(problem: Problem) -> tuple[Design, np.ndarray]:
         problem.direction[rows],
         seconds,
     )
-    return design, residual[rows]
+    return design, residual[rows], often
 
 
 def _sharp(problem: Problem, sizes: Sizes, fitted: list[np.ndarray], gains) -> list[Form]:

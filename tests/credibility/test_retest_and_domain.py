@@ -1,13 +1,17 @@
 """Agreement of recordings and shares of a scenario, both by hand."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from surgisoft.credibility import retest as retesting
 from surgisoft.credibility.context import Scenario
-from surgisoft.credibility.domain import States, applicability, percent, rates
+from surgisoft.credibility.domain import States, applicability, percent, rates, states_of
 from surgisoft.credibility.retest import Estimate, Repeated, Retest, Told, numbers
 from surgisoft.credibility.scenario import scenario_states, stored_episodes
 from surgisoft.errors import InputError
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.checkpoint import default_arm
 
 
@@ -92,6 +96,79 @@ def test_a_rate_counts_whichever_way_it_goes():
     known = states([[0.0], [10.0]], [[2.0], [-8.0]])
     found = applicability([known], [states([[0.0]] * 3, [[8.3], [8.5], [-8.3]])], 70.0)
     assert found.inside.tolist() == [True, False, True]
+
+
+def test_each_channel_has_a_range_and_a_fastest_rate_of_its_own():
+    """The ranges are those that were measured, however small or wide those asked about are."""
+    known = states([[0.0, 0.0], [10.0, 100.0]], [[1.0, 10.0], [-1.0, 10.0]])
+    asked = states([[0.9, 9.0], [1.1, 0.0]], [[1.0, 10.0], [0.0, 0.0]])
+    assert applicability([known], [asked], 70.0).inside.tolist() == [True, False]
+    wide = states([[1.1, 0.0], [500.0, 0.0]], [[0.0, 0.0]] * 2)
+    assert not applicability([known], [wide], 70.0).inside.any()
+    fast = states([[0.0, 0.0]] * 2, [[2.0, 0.0], [0.0, 9.0]])
+    assert applicability([known], [fast], 70.0).inside.tolist() == [False, True]
+
+
+def test_what_is_not_known_of_a_state_does_not_count():
+    """Shares are of the states of which a quantity is known; the others are not outside by it."""
+    rest = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 100.0]])
+    loads = np.array([0.0, np.nan])
+    known = states([[0.0], [10.0]], [[2.0], [np.nan]], np.stack([rest, rest + np.nan]), loads)
+    points = np.stack([rest, rest + 50.0, rest + np.nan, rest])
+    points[3, 0] = np.nan
+    load = np.array([np.nan, 0.0, 9.0, np.nan])
+    asked = states([[0.0]] * 4, [[np.nan], [2.0], [9.0], [np.nan]], points, load)
+    found = applicability([known], [asked], 100.0)
+    assert (found.pressures, found.rates, found.poses, found.loads) == (1.0, 0.5, 0.5, 0.5)
+    assert found.inside.tolist() == [True, False, False, True]
+
+
+def test_a_pose_is_that_of_one_row():
+    """Each key point was where it is, but never both of them at once."""
+    one = np.array([[0.0, 0.0, 50.0], [0.0, 0.0, 100.0]])
+    other = one + np.array([30.0, 0.0, 0.0])
+    known = states([[0.0], [10.0]], None, np.stack([one, other]))
+    mixed = np.stack([np.stack([one[0], other[1]]), other])
+    found = applicability([known], [states([[0.0]] * 2, None, mixed)], 100.0)
+    assert found.inside.tolist() == [False, True]
+
+
+def test_the_jump_from_one_run_to_the_next_is_no_rate():
+    """Each run rises by 1 kPa/s; the second begins 40 kPa higher."""
+    t_s = 0.1 * np.arange(40)
+    run = np.repeat([0, 1], 20)
+    pressure = (t_s + 40.0 * run)[:, None]
+    found = states_of(Recording("r", t_s, pressure, np.zeros((40, 1, 3)), run=run))
+    np.testing.assert_allclose(found.rate, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "fitted"),
+    [
+        ("identified", ["hysteresis", "creep"]),
+        ("several", ["hysteresis", "creep"]),
+        ("ambiguous", ["hysteresis"]),
+        ("nothing_missing", ["hysteresis"]),
+    ],
+)
+def test_the_effects_of_the_model_and_those_named_are_fitted_to_each(monkeypatch, kind, fitted):
+    """One of those that an ambiguous verdict names is not there: it is not fitted."""
+    asked = []
+    verdict = SimpleNamespace(kind=kind, effects=("creep",), confidence=0.9, sentence="")
+    whole = SimpleNamespace(verdict=verdict)
+    monkeypatch.setattr(retesting, "diagnose", lambda *given, **more: whole)
+    monkeypatch.setattr(retesting, "identification_problem", lambda model, some: some)
+    monkeypatch.setattr(
+        retesting,
+        "fit_effects",
+        lambda some, effects: (
+            asked.append((some[0].name, effects)) or SimpleNamespace(parameters=())
+        ),
+    )
+    model = SimpleNamespace(effects={"hysteresis": None}, takes_effects=True)
+    found = retesting.retest(model, [SimpleNamespace(name=name) for name in "ab"], whole)
+    assert asked == [("a", fitted), ("b", fitted)]
+    assert [each.recording for each in found.diagnoses] == ["a", "b"]
 
 
 def test_rates_are_taken_over_half_a_second():

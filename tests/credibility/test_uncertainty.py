@@ -7,7 +7,12 @@ import pytest
 import torch
 
 from surgisoft.credibility.context import Uncertainty
-from surgisoft.credibility.uncertainty import budget, parameter_spread, with_midpoints
+from surgisoft.credibility.uncertainty import (
+    budget,
+    input_uncertainty,
+    parameter_spread,
+    with_midpoints,
+)
 from surgisoft.diagnosis.residuals import residual_table
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import Recording
@@ -118,6 +123,55 @@ def test_stated_noise_counts_and_one_input_stands_for_all():
         budget(table, some, Uncertainty(input=(0.1, 0.1, 0.1)))
 
 
+def test_of_several_recordings_the_worst_sensors_count_and_commands_are_exact():
+    """The scatter of each recording at rest; a model of commands has none."""
+    some = []
+    for seed, sigma in enumerate((0.02, 0.2)):
+        noise = np.random.default_rng(seed).normal(0.0, sigma, (240, 2))
+        held = np.repeat(np.arange(8) % 3, 30)[:, None] * [1.0, 2.0] + 2.0
+        some.append(
+            dataclasses.replace(recording(name=f"r{seed}"), measured=held + noise, commanded=held)
+        )
+    arm = model(linear_network(2.0))
+    found, source = input_uncertainty(arm, some, Uncertainty())
+    assert found == pytest.approx([0.2, 0.2], rel=0.2)
+    assert source.startswith("scatter at rest")
+    by_command = arm.replace(spec=dataclasses.replace(arm.spec, actuation="commanded"))
+    found, source = input_uncertainty(by_command, some, Uncertainty())
+    assert found.tolist() == [0.0, 0.0]
+    assert source == "commands, taken as exact"
+
+
+def test_only_rows_that_were_measured_count():
+    """The tip moves by 2 mm/kPa in any row, of which it was seen in every second one."""
+    some = [recording()]
+    some[0].key_points_mm[::2, 1] = np.nan
+    found = budget(
+        residual_table(model(linear_network(2.0)), some), some, Uncertainty(input=(0.1,))
+    )
+    assert found.per_key_point[1].input_mm == pytest.approx(0.2, rel=1e-3)
+
+
+def test_a_direction_that_the_network_does_not_use_makes_it_no_surer():
+    torch.manual_seed(1)
+    network = HawNN(torch.zeros(2), torch.full((2,), 10.0), 2, hidden=(6,), directions=True)
+    network.use.copy_(torch.tensor([1.0, 0.0]))
+    rng = np.random.default_rng(0)
+    actuation = torch.from_numpy(rng.uniform(0.0, 10.0, (300, 2))).float()
+    residual = torch.from_numpy(rng.normal(0.0, 0.2, (300, 2, 3)))
+    signs = torch.from_numpy(rng.choice([-1.0, 1.0], (300, 2))).float()
+    spreads = []
+    for column in (0, 1):
+        arm, direction = model(network), signs.clone()
+        direction[:, column] = 1.0
+        arm.training_residuals = TrainingResiduals(actuation, direction, residual)
+        spreads.append(parameter_spread(residual_table(arm, [recording(40)]), Uncertainty())[0])
+    arm.training_residuals = TrainingResiduals(actuation, signs, residual)
+    whole = parameter_spread(residual_table(arm, [recording(40)]), Uncertainty())[0]
+    assert np.allclose(spreads[1], whole, rtol=1e-6), "the second direction is not used"
+    assert not np.allclose(spreads[0], whole, rtol=0.05)
+
+
 def test_the_spread_of_an_ensemble_is_that_of_its_members():
     """Two members 0.6 mm apart in y have a standard deviation of 0.6 / sqrt(2)."""
     low, high = torch.zeros(2), torch.full((2,), 10.0)
@@ -164,6 +218,8 @@ def test_midpoints_lie_between_rows_of_one_run():
         points,
         run=run,
         commanded=2 * pressure,
+        temp_C=np.array([20.0, 21.0, 22.0, 30.0, 32.0]),
+        payload_g=np.array([0.0, 0.0, 4.0, 5.0, 5.0]),
     )
     fine, own = with_midpoints(some)
     assert own.tolist() == [True, False, True, False, True, True, False, True]
@@ -171,6 +227,8 @@ def test_midpoints_lie_between_rows_of_one_run():
     assert fine.measured[:, 0].tolist() == [0.0, 0.5, 1.0, 2.0, 3.0, 9.0, 7.0, 5.0]
     assert fine.commanded[1].tolist() == [1.0, 8.0]
     assert fine.run.tolist() == [0, 0, 0, 0, 0, 1, 1, 1]
+    assert fine.temp_C.tolist() == [20.0, 20.5, 21.0, 21.5, 22.0, 30.0, 31.0, 32.0]
+    assert fine.payload_g.tolist() == [0.0, 0.0, 0.0, 2.0, 4.0, 5.0, 5.0, 5.0]
     assert np.isnan(fine.key_points_mm[~own]).all()
     settled = dataclasses.replace(some, kind="settled")
     assert with_midpoints(settled)[0] is settled

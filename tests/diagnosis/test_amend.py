@@ -20,7 +20,12 @@ from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import Recording, load_recording, save_recording
 from surgisoft.rig import VirtualRig
-from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
+from surgisoft.surrogate.checkpoint import (
+    default_arm,
+    load_model,
+    load_training_residuals,
+    save_model,
+)
 from tests.diagnosis.synthetic import recording, still_model, walk
 from tests.diagnosis.test_estimation import TRUTHS, bare_arm, measured_on
 
@@ -236,6 +241,7 @@ def test_the_error_falls_on_a_rig_whose_creep_has_another_form():
 def test_a_network_is_retuned_behind_an_effect_that_is_there_and_earns_it_no_claim():
     """The network is off by a constant: re-tuning mends that, beside creep and without it."""
     off = bare_arm()
+    off.training_residuals = load_training_residuals("default")
     with torch.no_grad():
         off.network.layers[-1].bias += 0.02
     with_creep = measured_on(TRUTHS["creep"], rows=250)
@@ -243,6 +249,12 @@ def test_a_network_is_retuned_behind_an_effect_that_is_there_and_earns_it_no_cla
     assert both.claimed
     assert both.retuned
     assert not kept.retuned
+    assert both.model.training_residuals is None, "those of another network"
+    assert kept.model.training_residuals is off.training_residuals is not None
+    for found, use, other in ((both, "fitted", "amended"), (kept, "amended", "fitted")):
+        share = found.model.fitted_rows.uses_of(history_of([with_creep]))
+        assert share[use] > 0.6
+        assert share[other] == 0.0
     assert both.alone == kept.held_out
     assert both.held_out.after < 0.7 * kept.held_out.after
     assert both.held_out.after < 1.5 * both.held_out.floor

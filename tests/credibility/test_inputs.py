@@ -14,6 +14,7 @@ from surgisoft.credibility.assessment import (
     criteria_of,
     fingerprint,
     inputs_of,
+    point_errors,
 )
 from surgisoft.credibility.context import (
     Context,
@@ -25,11 +26,17 @@ from surgisoft.credibility.context import (
     load_context,
 )
 from surgisoft.credibility.domain import States, applicability, rates, states_of
-from surgisoft.credibility.metrics import Criterion
+from surgisoft.credibility.metrics import Criterion, ValidationUncertainty
 from surgisoft.credibility.of_experiment import arm_of, check_context
 from surgisoft.credibility.retest import Estimate, Repeated, Retest, Told
-from surgisoft.credibility.scenario import agreement, outcomes, scenario_states, stored_episodes
-from surgisoft.credibility.uncertainty import budget
+from surgisoft.credibility.scenario import (
+    agreement,
+    outcomes,
+    scenario_states,
+    states_of_episode,
+    stored_episodes,
+)
+from surgisoft.credibility.uncertainty import Budget, budget
 from surgisoft.diagnosis.other_models import predicted_arm
 from surgisoft.diagnosis.residuals import UNKNOWN, residual_table
 from surgisoft.errors import InputError
@@ -92,6 +99,79 @@ def test_inputs_are_equivalent_as_far_as_both_sides_state_them(
     arm = model_of(dataclasses.replace(SPEC, **spec), *effects)
     found = inputs_of(arm, [recording(**measured)])
     assert (found[place].measured, found[place].simulated, found[place].equivalent) == expected
+
+
+def test_inputs_of_several_recordings_are_equivalent_where_those_of_each_are():
+    """Weight, load and room of the second differ, or are not stated of it."""
+    spec = dataclasses.replace(SPEC, gravity=(0.0, 0.0, 1.0), temperature_C=25.0)
+    cold = np.full(60, 25.0)
+    cold[30] = 20.0
+    good = {"gravity": DOWN, "payload_g": np.zeros(60), "temp_C": np.full(60, 25.0)}
+    turned = {"gravity": np.array([0.0, 1.0, 0.0]), "payload_g": np.full(60, -3.0), "temp_C": cold}
+    part = np.zeros(60)
+    part[5] = np.nan
+    for more, equivalent in (
+        (good, (True, True, True)),
+        (turned, (False, False, False)),
+        ({}, (None, None, True)),
+        ({"payload_g": part}, (None, None, True)),
+    ):
+        some = [recording(**good), recording(name="second", **more)]
+        found = inputs_of(model_of(spec), some)[2:]
+        assert tuple(each.equivalent for each in found) == equivalent
+
+
+def test_errors_of_points_by_hand():
+    """The base is predicted 1 mm too far in x, the tip 2 mm too far back in y; of the tip a row is
+    missing."""
+    measured = np.zeros((4, 2, 3))
+    predicted = measured + np.array([[1.0, 0.0, 0.0], [0.0, -2.0, 0.0]])
+    measured[2, 1] = np.nan
+    table = SimpleNamespace(
+        residual_mm=measured - predicted, predicted_mm=predicted, measured_mm=measured
+    )
+    compared = SimpleNamespace(per_key_point_mm=(1.0, 2.0), rmse_mm=1.5)
+    each = tuple(ValidationUncertainty(noise, None, None, None) for noise in (0.1, 0.2))
+    parts = Budget(each, ValidationUncertainty(0.15, None, None, None), {}, ())
+    base, tip, body = point_errors(table, compared, parts)
+    assert (base.label, tip.label, body.label) == ("k0", "k1", "body")
+    assert (base.error_mm, tip.error_mm, body.error_mm) == (1.0, 2.0, 1.5)
+    assert base.bias_mm == pytest.approx((1.0, 0.0, 0.0))
+    assert tip.bias_mm == pytest.approx((0.0, -2.0, 0.0))
+    assert body.bias_mm is None
+    found = [point.uncertainty_mm / 1.959964 for point in (base, tip, body)]
+    assert found == pytest.approx([0.1, 0.2, 0.15])
+    areas = [point.area_mm for point in (base, tip, body)]
+    assert areas == pytest.approx([1.0, 2.0, np.sqrt((1.0 + 4.0) / 2)])
+
+
+def test_nothing_is_met_by_errors_on_rows_of_the_fit():
+    points = [PointError(n, 0.1, None, 0.1, 0.1) for n in ("k0", "k1", "body")]
+    limits = Limits(error_mm=9.0, tip_error_mm=9.0, area_mm=9.0)
+    for fitted in (True, False):
+        found = criteria_of(context(limits=limits), points, None, fitted)
+        assert [each.passed for each in found] == [not fitted] * 3
+
+
+def test_a_key_point_that_was_never_measured_has_no_limit_to_keep():
+    unknown = PointError("k0", float("nan"), None, float("nan"), float("nan"))
+    points = [unknown, PointError("k1", 1.0, None, 0.5, 0.4), PointError("body", 1.0, None, 0.5, 0)]
+    found = criteria_of(context(limits=Limits(error_mm=1.6, area_mm=0.5)), points, None)
+    assert [(each.value, each.passed) for each in found] == [(1.5, True), (0.4, True)]
+
+
+def test_key_points_of_an_episode_are_in_the_frame_of_the_arms_base():
+    """The base stands at x = 10 mm and is turned by 90 degrees about z: its x is the world's y."""
+    log = episode()
+    mount = np.eye(4)
+    mount[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    mount[0, 3] = 10.0
+    points = np.tile([10.0, 3.0, 20.0], (*log.arms["arm"].points_mm.shape[:2], 1))
+    arm = dataclasses.replace(log.arms["arm"], mount=mount, points_mm=points)
+    (found,) = states_of_episode(dataclasses.replace(log, arms={"arm": arm}), "e")
+    assert found.points_mm.reshape(-1, 3) == pytest.approx(
+        np.tile([3.0, 0.0, 20.0], (len(points) * points.shape[1], 1))
+    )
 
 
 def test_a_channel_beyond_the_models_range_is_not_equivalent():

@@ -22,7 +22,7 @@ from surgisoft.scene.ablation import (
 )
 from surgisoft.scene.camera import Camera
 from surgisoft.scene.collision import CollisionChecker
-from surgisoft.scene.dose_patch import HEALTHY, LESION, RING, cut_patch, samples_at
+from surgisoft.scene.dose_patch import HEALTHY, LESION, RING, cut_patch, cut_patches, samples_at
 from surgisoft.scene.mesh import Body
 from surgisoft.scene.render import Renderer
 from tests.scene.engines import ON_ACCELERATORS
@@ -178,6 +178,28 @@ def test_an_open_ring_reports_its_gap(slab, share):
     assert report.completion.item() == pytest.approx(share, abs=0.02)
     assert report.largest_gap_deg.item() == pytest.approx(360 * (1 - share), abs=9)
     assert report.largest_gap_mm.item() == pytest.approx(62.8 * (1 - share), abs=1.6)
+    line = math.sqrt(2 / math.pi) * 5.0 * 10.0 / (WAIST * 2 * math.pi * 10.0 * share)
+    width = WAIST * math.sqrt(2 * math.log(line / ablation.threshold))
+    assert report.width_mm.item() == pytest.approx(width, rel=0.06), "where the ring is cut"
+
+
+def test_each_environment_cuts_the_ring_that_it_was_given_and_beams_add_up():
+    """Rings of 10 and 8 mm radius; uncut, the gap is all of the ring's own length."""
+    rings = [(*circle(radius, 5.0), np.array([0, 0, 5.0])) for radius in (10.0, 8.0)]
+    ablation = AblationMap(cut_patches(box((60, 60, 10)), rings, 0.36, 1.0, 1.0), WAIST)
+    points = torch.tensor([[[10.0, 0.0, 5.0], [0.0, 8.0, 5.0]]] * 2)
+    aim, on = DOWN.expand(2, 2, 3), torch.ones(2, 2, dtype=torch.bool)
+    state = ablation.start(points, aim, on, ring=torch.tensor([0, 1]))
+    gaps = 2.0 * math.pi * torch.tensor([10.0, 8.0])
+    torch.testing.assert_close(ablation.report(state).largest_gap_mm, gaps, rtol=1e-3, atol=0)
+    power = torch.tensor([[2.0, 3.0], [4.0, 0.0]])
+    state = ablation.advance(state, points, aim, on, power, 0.1)
+    torch.testing.assert_close(ablation.report(state).delivered_j, torch.tensor([0.5, 0.4]))
+    one = ablation.start(points[:1, 0], aim[:1, 0], on[:1, 0], ring=torch.tensor([1]))
+    assert ablation.alone(one).progress() == pytest.approx((0.0, gaps[1].item(), 0.0), rel=1e-3)
+    first = torch.tensor([True, False])
+    state = ablation.reset(state, first, points, aim, on, ring=torch.tensor([1, 0]))
+    assert state.ring.tolist() == [1, 1], "only the first was begun anew"
 
 
 def test_a_cut_beside_the_band_is_no_ring_but_healthy_tissue(slab):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from surgisoft.diagnosis.body_frame import frames, tangents
+from surgisoft.diagnosis.body_frame import bending, frames, tangents
 
 REST = np.stack([np.zeros(5), np.zeros(5), np.linspace(0, 60, 5)], axis=1)
 
@@ -41,3 +41,12 @@ def test_a_straight_body_has_a_frame_too():
     frame = frames(REST[None], REST)[0]
     assert np.isfinite(frame).all()
     assert frame[:, 1] == pytest.approx(np.tile([1.0, 0.0, 0.0], (5, 1)))
+
+
+def test_the_plane_of_an_arm_that_is_bent_at_rest_is_that_of_its_motion():
+    """At rest it bends towards x; moved towards y from there, it bends towards y."""
+    rest, _ = arc(0.5, 0.0)
+    moved = rest + np.outer(np.linspace(0, 1, 5), [0.0, 4.0, 0.0])
+    assert bending(moved[None], rest).tolist() == [[0.0, 4.0]]
+    frame = frames(moved[None], rest)[0]
+    assert (np.abs(frame[:, 2] @ [0.0, 1.0, 0.0]) < 0.1).all(), "out of plane is along x"

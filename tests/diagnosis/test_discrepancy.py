@@ -28,6 +28,13 @@ def test_errors_grow_along_the_body():
     assert matrix[0, 2] == matrix[0, 0]
 
 
+def test_a_key_point_is_as_uncertain_as_any_nearer_to_the_base():
+    """Its error is the sum of those of the sections below, even where it was validated to less."""
+    matrix = body_covariance(np.array([0.3, 0.1, 0.6]))
+    assert np.diag(matrix) == pytest.approx(np.array([0.09, 0.09, 0.36]) / 3)
+    assert matrix[1, 2] == pytest.approx(0.03)
+
+
 def test_errors_of_opposite_directions_have_less_in_common():
     """A share of 0.3 of the error follows the direction: 0.7 - 0.3 where both chambers turn."""
     x, up = np.array([[0.2, -0.4]]), np.ones((1, 2))

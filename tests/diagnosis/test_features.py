@@ -85,3 +85,42 @@ def test_features_are_finite_and_of_order_one(two_runs):
     assert np.abs(values).max() < 10
     untimed = features(memory, still_model().spec, None, timed=False)
     assert untimed.shape[1] < values.shape[1]
+
+
+def test_the_arm_dwells_while_no_chamber_moves():
+    """The second chamber rests from the start, the first one from 4 s on: since then it dwells."""
+    signal = np.stack([np.minimum(np.arange(100) * 0.2, 8.0), np.full(100, 5.0)], axis=1)
+    time = torch.tensor(PERIOD_S * np.arange(100))
+    memory = memory_of(
+        pack([time], [torch.tensor(signal)], [torch.zeros(100, 3, 3)]), still_model().spec
+    )
+    assert memory.dwell_s[99] == pytest.approx(9.9 - 4.0, abs=0.11)
+    assert memory.dwell_s[39] < 0.11
+
+
+def test_times_and_context_of_some_rows_are_scaled_by_all(two_runs):
+    """Two runs from 0 and 40 s on, the last row at 69.9 s; unknown temperatures are the mean."""
+    _, memory = two_runs
+    assert memory.in_run_s[[0, 399, 400, 699]] == pytest.approx([0.0, 39.9, 0.0, 29.9])
+    assert memory.elapsed_s[[0, 399, 400, 699]] == pytest.approx([0.0, 39.9, 40.0, 69.9])
+    context = np.full((700, 1), np.nan)
+    context[:300] = np.repeat([1.0, 4.0], [200, 100])[:, None]
+    spec, rows = still_model().spec, np.array([0, 250, 399, 400])
+    whole = features(memory, spec, context, timed=False)
+    some = features(memory, spec, context, timed=False, rows=rows)
+    np.testing.assert_array_equal(some, whole[rows])
+    assert some[:, -1] == pytest.approx([1.0, 4.0, 2.0, 2.0])
+    share = np.array([0.0, 25.0, 39.9, 40.0]) / 69.9
+    assert some[:, -5:-3] == pytest.approx(np.stack([share, share**2], axis=1))
+    in_run = np.array([0.0, 25.0, 39.9, 0.0]) / 39.9
+    assert some[:, -3:-1] == pytest.approx(np.stack([in_run, in_run**2], axis=1))
+
+
+def test_points_at_rest_have_no_time_constants(two_runs):
+    """Low passes of each chamber and the dwell time are for rows that follow each other in time."""
+    _, memory = two_runs
+    timed, settled = (
+        features(memory, still_model().spec, None, timed=timed) for timed in (True, False)
+    )
+    assert timed.shape[1] - settled.shape[1] == 2 * len(TIMES_S) + 1
+    np.testing.assert_array_equal(timed[:, : settled.shape[1]], settled)

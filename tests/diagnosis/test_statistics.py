@@ -11,6 +11,7 @@ from surgisoft.diagnosis.statistics import (
     cross_validated_ridge,
     sign_flip_p_values,
     studentised,
+    variance_between,
     win_shares,
 )
 
@@ -46,6 +47,29 @@ def test_one_block_gives_no_interval():
     low, high = mean_of(np.ones(5), np.zeros(5, int))
     assert np.isnan(low)
     assert np.isnan(high)
+
+
+def test_draws_without_a_value_are_left_out_unless_they_are_most():
+    """Of two blocks the one with a value comes in 3 of 4 draws, twice in one of these."""
+    sums = (np.array([1.0, 0.0]),)
+    at_least_once = block_interval(lambda total: np.where(total > 0, total, np.nan), sums)
+    assert at_least_once == (1.0, 2.0)
+    twice = block_interval(lambda total: np.where(total > 1, total, np.nan), sums)
+    assert np.isnan(twice).all()
+
+
+def test_the_variance_between_samples_by_hand():
+    """1, 3 and 5 with a variance of 1 each: Q = 8 exceeds 2 by 6, over 3 - 1: 3, not 4.
+
+    With variances of 1, 1 and 4: weights 1, 1 and 1/4, mean 7/3 and Q = 4, exceeding 2 by 2, over
+    9/4 - (33/16) / (9/4) = 4/3.
+    """
+    values = np.array([1.0, 3.0, 5.0])
+    assert variance_between(values, np.ones(3)) == pytest.approx(3.0)
+    assert variance_between(values, np.array([1.0, 1.0, 4.0])) == pytest.approx(1.5)
+    assert variance_between(values, np.zeros(3)) == pytest.approx(4.0)
+    assert variance_between(values, np.full(3, 9.0)) == 0.0
+    assert variance_between(values[:1], np.ones(1)) == 0.0
 
 
 def test_rows_of_no_block_are_left_out():
@@ -125,6 +149,31 @@ def test_missing_targets_are_left_out_of_the_fit():
     keep = ~np.isnan(y[:, 0])
     alone = cross_validated_ridge(x[keep], y[keep, :1], fold[keep], penalties=(1e-12,))
     assert found.predicted[keep, 0] == pytest.approx(alone.predicted[:, 0], abs=1e-6)
+
+
+def test_a_penalty_is_a_share_of_the_rows_and_not_on_the_mean():
+    """Normal equations of centred rows, with 0.1 of the 40 rows that are left as the penalty."""
+    rng = np.random.default_rng(3)
+    x, fold = rng.normal(2.0, 3.0, (60, 4)), np.arange(60) % 3
+    y = 500.0 + x @ rng.normal(size=(4, 2)) + rng.normal(size=(60, 2))
+    found = cross_validated_ridge(x, y, fold, penalties=(0.1,)).predicted
+    z = (x - x.mean(0)) / x.std(0)
+    for number in range(3):
+        kept, out = fold != number, fold == number
+        middle, mean = z[kept].mean(0), y[kept].mean(0)
+        gram = (z[kept] - middle).T @ (z[kept] - middle) + 0.1 * 40 * np.eye(4)
+        slopes = np.linalg.solve(gram, (z[kept] - middle).T @ (y[kept] - mean))
+        np.testing.assert_allclose(found[out], mean + (z[out] - middle) @ slopes, rtol=1e-7)
+
+
+def test_a_target_that_is_often_missing_does_not_shrink_the_fit_of_another():
+    rng = np.random.default_rng(4)
+    x, fold = rng.normal(size=(60, 4)), np.arange(60) % 3
+    y = x @ rng.normal(size=(4, 2)) + rng.normal(size=(60, 2))
+    y[20:, 0] = np.nan
+    found = cross_validated_ridge(x, y, fold, penalties=(0.1,)).predicted
+    alone = cross_validated_ridge(x, y[:, 1:], fold, penalties=(0.1,)).predicted
+    np.testing.assert_allclose(found[:, 1:], alone)
 
 
 def test_noise_is_not_predicted():

@@ -7,11 +7,13 @@ import pytest
 
 from surgisoft.diagnosis.residuals import (
     held_out_rows,
+    noise_of,
     problem_of,
     repeat_floor,
     residual_table,
+    with_training_noise,
 )
-from tests.diagnosis.synthetic import NOISE_MM, recording, still_model, walk
+from tests.diagnosis.synthetic import NOISE_MM, recording, resting_together, still_model, walk
 
 FLOOR = np.sqrt(3) * NOISE_MM
 CYCLE = walk(300, seed=3)
@@ -83,6 +85,41 @@ def test_held_out_rows_take_no_part_in_a_floor_from_second_differences():
         assert wild.only(part).floor.rmse_mm == pytest.approx(FLOOR, rel=0.05)
         assert wild.view(part).noise_mm == pytest.approx(NOISE_MM * np.sqrt(3), rel=0.1)
     assert wild.only("all").floor.rmse_mm > 1.2 * FLOOR
+
+
+def test_the_noise_of_a_comparison_is_that_of_the_training_rows():
+    """Of holds; where no key point of a training row was measured it stays that of all rows."""
+    made = recording(np.zeros(2400), resting_together(2400), noise_mm=None)
+    held = held_out_rows([made])
+    points = made.key_points_mm.copy()
+    points[held] += np.random.default_rng(7).normal(0, 40 * NOISE_MM, points[held].shape)
+    plain, wild = (
+        with_training_noise(residual_table(still_model(), [each]), [each])
+        for each in (made, replace(made, key_points_mm=points))
+    )
+    assert wild.floor == plain.floor != residual_table(still_model(), [made]).floor
+    assert wild.holds == plain.holds
+    np.testing.assert_array_equal(wild.noise_mm, plain.noise_mm)
+    assert wild.floor.source == "holds"
+    alone = replace(made, key_points_mm=np.where(held[:, None, None], points, np.nan))
+    table = residual_table(still_model(), [alone])
+    assert with_training_noise(table, [alone]).floor == table.floor
+
+
+def test_second_differences_are_those_within_a_run():
+    """Runs of four rows, each with its tip somewhere else: half of all differences cross runs."""
+    ramp = np.arange(1200)[:, None] % 97 / 10 * [1.0, 0.5]
+    run = np.repeat(np.arange(300), 4)
+    places = np.random.default_rng(5).normal(0.0, 5.0, 300)
+    noise, source = noise_of([recording(places[run], ramp, run=run, noise_mm=None)])
+    assert source == "second differences"
+    assert noise == pytest.approx(np.full(3, FLOOR), rel=0.1)
+
+
+def test_the_scatter_in_holds_is_that_of_three_coordinates():
+    made = recording(np.zeros(2400), resting_together(2400), noise_mm=None)
+    floor = residual_table(still_model(), [made]).floor
+    assert (floor.source, floor.rmse_mm) == ("holds", pytest.approx(FLOOR, rel=0.15))
 
 
 def test_second_differences_find_the_noise_of_a_smooth_motion():

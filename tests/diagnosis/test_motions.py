@@ -100,6 +100,14 @@ def test_neighbouring_motions_are_left_out_together_where_there_are_ten_of_them(
     assert folds(np.zeros(12, int)).tolist() == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 0, 0]
 
 
+def test_a_short_motion_inside_a_long_one_is_not_the_same():
+    """All of the first comes again in the second, of which most is something else."""
+    once = sweep(1.0, 1)
+    rows = np.concatenate([once, once, walk(3 * len(once))])
+    block = np.repeat([0, 1], [len(once), 4 * len(once)])
+    assert motions(path(rows), HALF, block).tolist() == [0, 1]
+
+
 def test_a_rest_repeats_no_motion():
     """Two rests at the same actuation; and a sweep with a rest that is longer than it."""
     rest = np.tile([3.0, 4.0], (200, 1))

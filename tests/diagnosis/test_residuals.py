@@ -8,11 +8,13 @@ import pytest
 from surgisoft.diagnosis import data_quality
 from surgisoft.diagnosis.data_quality import thinning_notes
 from surgisoft.diagnosis.residuals import (
+    blocks,
     held_out_rows,
     model_discrepancy,
     problem_of,
     residual_table,
 )
+from surgisoft.errors import InputError
 from surgisoft.measurement.histories import arm_spec, history_of
 from surgisoft.measurement.noise import known_noise
 from surgisoft.surrogate.fit import FitConfig, fit
@@ -78,6 +80,32 @@ def test_a_long_recording_is_cut_into_blocks_of_enough_fitted_rows():
     assert len(problem.block) == 2000
     assert np.bincount(problem.block).min() >= 7
     assert 240 <= problem.block.max() + 1 <= 250
+
+
+def test_a_block_lies_in_one_run_and_runs_of_some_seconds_are_cut():
+    """One run of 20 s and nine of 2 s at 10 Hz: stretches of 38 s / 20, none across two runs."""
+    run = np.concatenate([np.zeros(200, int), np.repeat(np.arange(1, 10), 20)])
+    history = history_of([recording(np.zeros(380), walk(380), run=run)])
+    seen = np.ones(380, bool)
+    seen[5] = False
+    found = blocks(history, seen)
+    assert found[5] == -1
+    owners = [set(run[found == number]) for number in range(found.max() + 1)]
+    assert all(len(owner) == 1 for owner in owners)
+    assert owners[-9:] == [{number} for number in range(1, 10)], "short runs are whole"
+    assert len(owners) == 9 + 11, "20 s in stretches of about 1.8 s"
+    with pytest.raises(InputError, match="expected at least 30 of 8 rows: record more"):
+        blocks(history, seen, least_blocks=30)
+
+
+def test_a_paired_difference_has_a_discrepancy_and_a_tolerance_of_its_own():
+    table = residual_table(validated_model(), [recording(np.zeros(600), walk(600))])
+    plain = table.view()
+    np.testing.assert_array_equal(plain.discrepancy_mm, plain.tolerance_mm)
+    own, allowed = np.array([0.1, 0.2, 0.3]), np.array([0.4, 0.5, 0.6])
+    paired = replace(table, paired_discrepancy_mm=own, paired_tolerance_mm=allowed).view()
+    np.testing.assert_array_equal(paired.discrepancy_mm, own)
+    np.testing.assert_array_equal(paired.tolerance_mm, allowed)
 
 
 def test_the_last_quarter_is_held_out():

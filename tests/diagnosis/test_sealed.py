@@ -121,3 +121,19 @@ def test_held_out_rows_are_opened_once(pair):
     np.testing.assert_array_equal(check.measured, made.key_points_mm[held])
     with pytest.raises(ValueError, match="used before"):
         sealed.opened(table)
+
+
+def test_the_held_out_rows_come_back_once_beside_training_rows_as_they_are():
+    """What was changed in the training rows since stays changed, in the history too."""
+    made = synthetic_recording(np.zeros(400), resting_together(400))
+    held = held_out_rows([made])
+    sealed = Sealed([made])
+    table = residual_table(still_model(), sealed.training)
+    changed = replace(table, measured_mm=table.measured_mm + 1.0)
+    opened = sealed.opened(changed)
+    expected = made.key_points_mm + 1.0 * ~held[:, None, None]
+    np.testing.assert_array_equal(opened.measured_mm, expected)
+    inside = opened.history.rows(opened.history.key_points).numpy()
+    np.testing.assert_allclose(inside, expected, atol=1e-4)
+    with pytest.raises(ValueError, match="used before"):
+        sealed.opened(changed)

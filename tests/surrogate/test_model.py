@@ -13,9 +13,12 @@ from surgisoft.errors import InputError
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.effects import make_effect
+from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.history import pack
-from surgisoft.surrogate.model import ArmModel, arm_facts
+from surgisoft.surrogate.interval import ErrorInterval
+from surgisoft.surrogate.model import ArmModel, Validation, arm_facts
 from surgisoft.surrogate.networks import ConstantCurvature, HawNN, KernelArm, RecurrentArm
+from surgisoft.surrogate.training_residuals import TrainingResiduals
 
 SPEC = ArmSpec(3, 5, (-15.0,) * 3, (54.0,) * 3, band=(0.2,) * 3)
 LOW, HIGH = torch.tensor(SPEC.low), torch.tensor(SPEC.high)
@@ -111,6 +114,71 @@ def test_a_run_cut_after_a_long_hold_goes_on_as_the_whole_one(effects):
     late = (arm.predict(cut)[0] - went_on)[1:].norm(dim=-1).amax()
     fresh = (arm.predict(replace(cut, stood=None))[0] - went_on)[1:].norm(dim=-1).amax()
     assert late < 0.05 * fresh
+
+
+def test_a_run_begins_at_rest_or_where_its_first_row_is():
+    """One chamber away from rest is enough; steady-state points do not say where they began."""
+    arm, history = model(), walks([5, 5, 5, 5])
+    history.pressure[:, 0] = torch.tensor([[20.0, 30.0, 40.0]])
+    near, away = [0.1, 0.0, -0.1], [0.1, 20.0, 0.0]
+    stood = torch.tensor([near, away, [torch.nan] * 3, near])
+    begun = arm.first_pressure(replace(history, stood=stood))
+    assert begun.tolist() == [[0.0] * 3, [20.0, 30.0, 40.0], [0.0] * 3, [0.0] * 3]
+    assert not arm.first_pressure(replace(history, stood=None)).any()
+    still = arm.replace(spec=replace(SPEC, idle=(None, 20.0, None)))
+    begun = still.first_pressure(replace(history, stood=stood))
+    assert (begun[1] - begun[0]).abs().max() == 0.0, "a chamber that never moves does not decide"
+
+
+def test_residuals_are_measured_less_predicted_in_rows_that_were_measured():
+    """Of 40 rows 30 have a key point; at most 20 are asked for, so that it is every second one."""
+    arm, history = model(), walks([20, 20])
+    points = arm.predict(history) + torch.tensor([1.0, 2.0, 3.0])
+    points[:, ::4] = torch.nan
+    points[:, :, 0] = torch.nan
+    found = arm.residuals_on([replace(history, key_points=points)], rows=20)
+    assert found.residual_mm.shape == (15, 5, 3)
+    assert found.residual_mm[:, 0].isnan().all()
+    expected = torch.tensor([1.0, 2.0, 3.0]).expand(15, 4, 3)
+    torch.testing.assert_close(found.residual_mm[:, 1:], expected, atol=1e-4, rtol=0)
+    seen = torch.cat([run[torch.arange(20) % 4 != 0] for run in history.pressure])
+    torch.testing.assert_close(found.actuation, seen[::2])
+
+
+def test_parts_that_belong_to_one_fit_are_dropped_with_it():
+    """Training residuals are those of network and effects; the rows of the fit stay known."""
+    arm, history = model(), walks([20])
+    arm.training_residuals = arm.residuals_on([history])
+    arm.fitted_rows = FittedRows.of([history])
+    for changed in (arm.replace(effects={}), arm.replace(network=arm.network)):
+        assert changed.training_residuals is None
+        assert changed.fitted_rows is arm.fitted_rows
+    same = arm.replace(spec=replace(SPEC, unit="psi"))
+    assert same.training_residuals is arm.training_residuals
+    assert same.fitted_rows is arm.fitted_rows
+
+
+def test_a_radius_that_grows_with_the_distance_needs_the_rows_of_the_fit():
+    """2 mm at the actuation of the fit, 6 mm a whole range of one chamber (69 kPa) away."""
+    steady = ErrorInterval((0.95,), ((2.0,) * 5,), (0.0,) * 5, 500, 20, "s")
+    growing = replace(steady, growth=(2.0,) * 5)
+    asked = torch.tensor([[-15.0, 0.0, 0.0], [54.0, 0.0, 0.0]])
+    arm = model().replace(validation=replace(Validation(), interval=steady))
+    assert arm.states_interval
+    assert arm.error_radius(asked).tolist() == [[2.0] * 5] * 2
+    arm = model().replace(validation=replace(Validation(), interval=growing))
+    assert not arm.states_interval
+    with pytest.raises(InputError, match="states no prediction interval"):
+        arm.error_radius(asked)
+    arm.training_residuals = TrainingResiduals(asked[:1], torch.zeros(1, 3), torch.zeros(1, 5, 3))
+    assert arm.states_interval
+    torch.testing.assert_close(arm.error_radius(asked), torch.tensor([[2.0] * 5, [6.0] * 5]))
+
+
+def test_effects_stand_in_the_order_of_their_stages():
+    given = {name: make_effect(name, FACTS) for name in ("misalignment", "payload", "line_lag")}
+    arm = model().replace(effects=given)
+    assert list(arm.effects) == ["line_lag", "payload", "misalignment"]
 
 
 def test_a_batch_is_its_arms_one_by_one():

@@ -279,6 +279,14 @@ def test_the_second_effect_of_an_answer_does_not_repeat_its_sentence(recited):
     assert result.rounds[1].sentence == "named beside creep by the same diagnosis"
 
 
+def test_no_more_effects_are_added_than_asked_for(recited):
+    """A diagnosis names two where one is allowed."""
+    recited(said("several", "creep", "gain_mismatch"), said("nothing_missing"))
+    truth = with_truth("gain_mismatch", {"gain": [0.06, -0.02, -0.05]}, TRUTHS["creep"])
+    result = improve(bare_arm(), [measured_on(truth, rows=150)], most_effects=1)
+    assert list(result.model.effects) == ["creep"]
+
+
 def test_tables_follow_the_confidence_that_they_print():
     """Equal confidences by the error that is left."""
     rows = [("a", 0.001, 0.5), ("b", 0.004, 0.2), ("c", 0.9, 0.4), ("d", 0.06, 0.1)]

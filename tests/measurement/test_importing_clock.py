@@ -146,6 +146,10 @@ def test_the_number_in_the_note_puts_the_log_right(tmp_path):
     (note,) = [note for note in notes if "delay_s" in note]
     value = float(note.split("delay_s = ")[1].split()[0])
     assert value == pytest.approx(0.04, abs=0.002)
+    _, notes = imported(tmp_path, table, "delay_s = 0.02")
+    (note,) = [note for note in notes if "delay_s" in note and "before its measured" in note]
+    whole = float(note.split("delay_s = ")[1].split()[0])
+    assert whole == pytest.approx(0.04, abs=0.002), "what is left is added to the map's own"
     recording, notes = imported(tmp_path, table, f"delay_s = {value}")
     assert not any("before its measured" in note for note in notes)
     kept = t_s[: recording.samples]

@@ -143,6 +143,56 @@ def test_a_folder_means_all_raw_files_in_it(tmp_path):
         run(tmp_path, [tmp_path], TWO.replace("OFFSET", ""))
 
 
+BY_TIME = """
+[file.positions]
+match = "pos*"
+[file.inputs]
+match = "inp*"
+join = "time"
+time = "s"
+CLOCK
+[time]
+column = "t"
+SCALE
+[measured]
+file = "inputs"
+columns = ["u"]
+unit = "kPa"
+[key_points]
+positions = [["x", "y", "z"]]
+unit = "mm"
+"""
+
+
+@pytest.mark.parametrize(
+    ("clock", "scale", "moved_s"),
+    [
+        ("clock_offset_s = 0.25", "", -0.25),
+        ("clock_offset_s = -0.25", "", 0.25),
+        ('clock = "from_start"', "", -2.0),
+        ('clock = "from_start"', "scale = 0.5", -1.0),
+    ],
+)
+def test_the_clock_of_a_second_file_is_shifted_or_begins_with_the_first(
+    tmp_path, clock, scale, moved_s
+):
+    """Actuation is 10 kPa/s on its own clock, from 0 s on; the positions begin at 2 s on theirs,
+    whose seconds may be half as long. An offset is added to the clock of the second file."""
+    s = np.arange(100) / 10
+    t = 2.0 + np.arange(40) / 10
+    u = np.stack([s, 10.0 * s], axis=1)
+    where = np.column_stack([t, t, 10 + t, 20 + t])
+    files = [
+        written(tmp_path / "inp.csv", text(u, header=["s", "u"])),
+        written(tmp_path / "pos.csv", text(where, header=["t", "x", "y", "z"])),
+    ]
+    (part,) = run(tmp_path, files, BY_TIME.replace("CLOCK", clock).replace("SCALE", scale))
+    seconds = t * (0.5 if scale else 1.0)
+    expected = 10.0 * (seconds + moved_s)
+    np.testing.assert_allclose(part.recording.measured[:, 0], expected, atol=1e-9)
+    np.testing.assert_allclose(part.recording.key_points_mm[:, 0, 0], t)
+
+
 # --- rows and runs of one file -----------------------------------------------------------------
 
 

@@ -145,7 +145,7 @@ def test_a_clean_recording_is_refused(lab, capsys):
     before = hashes(lab)
     command = ["amend", str(lab / "arm"), "--effect", "creep", "--data", str(lab / "clean.parquet")]
     assert run([*command, "-o", str(lab / "refused")]) == 1
-    assert "no fall of the error is claimed" in capsys.readouterr().out
+    assert "no reduction of the error is claimed" in capsys.readouterr().out
     assert hashes(lab) == before
     assert run([*command, "-o", str(lab / "anyway"), "--anyway"]) == 1
     assert load_model(lab / "anyway").effects["creep"].amount.abs() < 0.02

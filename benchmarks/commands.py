@@ -286,6 +286,20 @@ def setup_faults(
             help="Folder with model/, clean/*.parquet and hidden/*.parquet of another arm.",
         ),
     ] = None,
+    cases: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder of cases of another simulator, as python -m benchmarks.chain_cases makes "
+            "them. Faults are put into its cases in which nothing is missing.",
+        ),
+    ] = None,
+    models: Annotated[
+        Path,
+        typer.Option(
+            metavar="DIR", help="Folder of the models of their robots; missing ones are fitted."
+        ),
+    ] = Path("runs/benchmark-decision/models"),
     count: Annotated[
         int, typer.Option(min=1, help="Number of single faults, and of pairs, of each source.")
     ] = 100,
@@ -297,11 +311,13 @@ def setup_faults(
     """Benchmark of the set-up tests: wrong frames, units, orders, chambers and clocks."""
     from benchmarks.setup_faults import markdown, run
 
-    numbers = _numbers("--robots", robots)
+    numbers = _numbers("--robots", robots) if robots else []
+    some = [(folder, models) for folder in cases or []]
     with _kept("setup-faults", work) as report:
-        outcomes = run(numbers, folders or [], count, seed, work, processes, report)
-    command = f"surgisoft benchmark setup-faults --robots {robots} --count {count} --seed {seed}"
+        outcomes = run(numbers, folders or [], some, count, seed, work, processes, report)
+    command = f"surgisoft benchmark setup-faults --robots '{robots}' --count {count} --seed {seed}"
     command += "".join(f" --source {folder.name}" for folder in folders or [])
+    command += "".join(f" --cases {folder.name}" for folder in cases or [])
     _show("Set-up faults", command, markdown(outcomes), output)
 
 

@@ -1,13 +1,14 @@
 """Benchmark `setup-faults`: faults of the set-up put into recordings, and recordings without any.
 
 Every fault alone and in pairs, with random parameters, in recordings of several sources: the
-virtual rig, other rigs whose recordings and models lie in folders, and real robots. A fault is
-found if the verdict names its kinds and no other, and the correction restores the original:
-key points to the error of the model, actuation to 2 % of its range. False alarms are counted on
-clean recordings and on recordings with each hidden effect of the rig.
+virtual rig, folders of cases of other simulators, and other arms whose recordings and models lie
+in folders. A fault is found if the verdict names its kinds and no other, and the correction
+restores the original: key points to the error of the model, actuation to 2 % of its range. False
+alarms are counted on clean recordings and on recordings with each hidden effect.
 """
 
 import itertools
+import json
 import time
 from collections.abc import Callable
 from concurrent.futures import as_completed
@@ -18,8 +19,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.decision.folders import model_folder
 from benchmarks.diagnosis.robots import base_model
 from surgisoft.diagnosis.setup import SetupResult, find_setup_faults
+from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import Recording, load_recording, save_recording
 from surgisoft.progress import Progress
@@ -60,6 +63,8 @@ class Outcome:
     """Name of the source."""
     recording: str
     """Name of the recording."""
+    clean: bool
+    """Whether nothing but the faults is wrong in it."""
     truth: tuple[str, ...]
     """Faults that were put in."""
     found: tuple[str, ...]
@@ -249,7 +254,8 @@ def run_case(source: Source, path: Path, truth: tuple[str, ...], seed: int) -> O
     named = first or any(tuple(sorted(f.kind for f in some)) == kinds for some in others)
     return Outcome(
         source=source.name,
-        recording=path.stem,
+        recording=_name(path),
+        clean=path in source.clean,
         truth=truth,
         found=found.kinds if found else (),
         named=named if truth else found is None,
@@ -258,6 +264,11 @@ def run_case(source: Source, path: Path, truth: tuple[str, ...], seed: int) -> O
         seconds=seconds,
         sentence=found.sentence if found else "",
     )
+
+
+def _name(path: Path) -> str:
+    """Name of a recording: that of its file, or the number of its case."""
+    return f"case {path.parents[1].name}" if path.parent.name == "after" else path.stem
 
 
 def _gives_back(found: SetupResult, wrong: Recording, original: Recording, model) -> bool:
@@ -343,32 +354,58 @@ def given(folder: Path) -> Source:
     )
 
 
+def of_cases(folder: Path, models: Path) -> list[Source]:
+    """The robots of a folder of cases, with their models; a model that is missing is fitted.
+
+    models: folder of models, as `surgisoft benchmark decision` leaves them.
+    """
+    robots: dict[str, tuple[list[Path], list[Path]]] = {}
+    for file in sorted(folder.glob("cases/*/truth.json")):
+        truth = json.loads(file.read_text())
+        clean, hidden = robots.setdefault(truth["robot"], ([], []))
+        (hidden if truth["truth"] else clean).extend(sorted(file.parent.glob("after/*.parquet")))
+    if not any(clean for clean, _ in robots.values()):
+        raise InputError(f"{folder}: expected cases of which one at least has an empty truth")
+    return [
+        Source(folder.name, model_folder(folder, robot, models), tuple(clean), tuple(hidden))
+        for robot, (clean, hidden) in sorted(robots.items())
+    ]
+
+
 def run(
     robots: list[int],
     folders: list[Path],
+    cases: list[tuple[Path, Path]],
     count: int,
     seed: int,
     work: Path,
     processes: int,
     report: Progress,
 ) -> list[Outcome]:
-    """All outcomes: `count` single faults and `count` pairs for each source, and none."""
+    """All outcomes: `count` single faults and `count` pairs for each source, and none.
+
+    robots: seeds of the own rig; folders: of other arms (`given`); cases: folders of cases and of
+    the models of their robots (`of_cases`).
+    """
     with workers(processes) as pool:
         jobs = [pool.submit(collect, robot, work) for robot in robots]
         for done, future in enumerate(as_completed(jobs)):
             future.result()
             report(done + 1, len(jobs), "robots recorded")
         sources = [job.result() for job in jobs] + [given(folder) for folder in folders]
+        for folder, models in cases:
+            sources += of_cases(folder, models)
         tasks = []
         for name in dict.fromkeys(source.name for source in sources):
-            same = [source for source in sources if source.name == name]
+            every = [source for source in sources if source.name == name]
+            same = [source for source in every if source.clean]
             unit = load_recording(same[0].clean[0], on_warning=lambda text: None).unit
             without = () if unit in UNITS else ("actuation unit",)
             for i, truth in enumerate(drawn(count, seed, without)):
                 source = same[i % len(same)]
                 path = source.clean[(i // len(same)) % len(source.clean)]
                 tasks.append((source, path, truth, seed + i))
-            for source in same:
+            for source in every:
                 tasks += [(source, path, (), 0) for path in (*source.clean, *source.hidden)]
         futures = [pool.submit(run_case, *task) for task in tasks]
         for done, future in enumerate(as_completed(futures)):
@@ -408,8 +445,8 @@ def _summary(some: list[Outcome]) -> str:
         rows.append(
             f"| {text}: named first, and corrected | 99 % | {_share(faulty, 'corrected')} |"
         )
-    clean = [o for o in some if not o.truth and o.recording.startswith("clean")]
-    hidden = [o for o in some if not o.truth and not o.recording.startswith("clean")]
+    clean = [o for o in some if not o.truth and o.clean]
+    hidden = [o for o in some if not o.truth and not o.clean]
     for text, group in (("clean", clean), ("a physical effect", hidden)):
         if group:
             false = [replace(o, named=not o.named) for o in group]

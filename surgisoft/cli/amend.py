@@ -64,7 +64,7 @@ def amend(
         bool,
         typer.Option(
             "--anyway",
-            help="Write NEW even if no fall of the held-out error is claimed.",
+            help="Write NEW even if no reduction of the held-out error is claimed.",
         ),
     ] = False,
     keep_network: Annotated[

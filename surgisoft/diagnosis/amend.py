@@ -102,7 +102,7 @@ class Fall:
         low = self.ci95[0]
         if self.in_fit and self.significant:
             return (
-                "no fall on unseen data is claimed, because the model had been fitted "
+                "no reduction on unseen data is claimed, because the model had been fitted "
                 f"to {self.in_fit:.0%} of the held-out rows: {self.numbers('there')}"
             )
         numbers = self.numbers(
@@ -119,14 +119,15 @@ class Fall:
             why = (
                 f"may be the network's own error, which the effect resembles (p {self.p_value:.2g})"
             )
-        return f"no fall of the error is claimed: {numbers} {why}"
+        return f"no reduction of the error is claimed: {numbers} {why}"
 
     def numbers(self, where: str) -> str:
         """Both errors and the fall; where: on which rows, in words."""
         low, high = self.ci95
         return (
             f"{self.before:.3f} to {self.after:.3f} mm {where} "
-            f"(fall {self.fall:.3f} mm, 95 % {low:.3f} to {high:.3f}; floor {self.floor:.3f} mm)"
+            f"(reduction {self.fall:.3f} mm, 95 % {low:.3f} to {high:.3f}; "
+            f"floor {self.floor:.3f} mm)"
         )
 
     def to_json(self) -> dict:
@@ -239,7 +240,7 @@ class Amendment:
         if self._seen_before:
             head = "error reduced from"
             if not self.alone.significant:
-                head = "no fall of the error is claimed:"
+                head = "no reduction of the error is claimed:"
             where = "on rows that neither training saw"
             return (
                 f"{head} {self.alone.numbers(where)}, fitted together with the network, compared "
@@ -253,7 +254,7 @@ class Amendment:
         )
         if self.held_out.claimed and not self.alone.claimed:
             return (
-                f"no fall of the error is claimed for the effects: {network}, and with them "
+                f"no reduction of the error is claimed for the effects: {network}, and with them "
                 f"{self.alone.after:.3f} mm remain"
             )
         return f"{self.held_out.sentence}, fitted together with the network; {network}"

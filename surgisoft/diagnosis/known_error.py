@@ -72,8 +72,7 @@ def known_error(after: ResidualTable, before: ResidualTable) -> KnownError:
     """Learn what a model gets wrong on BEFORE, and predict it for AFTER."""
     rows = np.flatnonzero(np.isfinite(before.residual_mm).all(2).any(1))
     rows = rows[:: max(1, -(-len(rows) // KNOWN_ROWS))]
-    known, asked = _inputs(before.memory, before.spec), _inputs(after.memory, after.spec)
-    known = known[rows]
+    known, asked = _inputs(before.memory, before.spec, rows), _inputs(after.memory, after.spec)
     # Beyond what BEFORE has shown nothing was learned.
     asked = np.clip(asked, known.min(axis=0), known.max(axis=0))
     block = _first_blocks(before, rows)
@@ -115,16 +114,19 @@ def _first_blocks(before: ResidualTable, rows: np.ndarray) -> np.ndarray:
     return np.unique(part, return_inverse=True)[1]
 
 
-def _inputs(memory: Memory, spec: ArmSpec) -> np.ndarray:
-    """(N, F) actuation, its past, and their products with the actuation; all of order 1.
+def _inputs(memory: Memory, spec: ArmSpec, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+    """(N, F) actuation of N rows, its past, and their products with the actuation; of order 1.
 
     Neither time nor what comes once in a recording (the largest actuation so far) is among them: it
     would not come again.
     """
     half = half_range(spec)
-    x = (memory.pressure - np.array(spec.low)) / half - 1.0
-    past = [memory.play[..., k] - memory.pressure for k in range(memory.play.shape[-1])]
-    past += [memory.pressure - memory.low_pass[..., k] for k in range(memory.low_pass.shape[-1])]
-    own = np.concatenate([x, memory.direction, *(each / half for each in past)], axis=1)
+    pressure, play, low_pass = (
+        each[rows] for each in (memory.pressure, memory.play, memory.low_pass)
+    )
+    x = (pressure - np.array(spec.low)) / half - 1.0
+    past = [play[..., k] - pressure for k in range(play.shape[-1])]
+    past += [pressure - low_pass[..., k] for k in range(low_pass.shape[-1])]
+    own = np.concatenate([x, memory.direction[rows], *(each / half for each in past)], axis=1)
     products = (own[:, :, None] * x[:, None, :]).reshape(len(x), -1)
     return np.concatenate([own, products], axis=1)

@@ -26,6 +26,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from scipy.fft import irfft, next_fast_len, rfft
 
 from surgisoft.diagnosis.abrupt import body_jumps, own_jumps_mm
 from surgisoft.diagnosis.discrepancy import LENGTHS
@@ -440,13 +441,16 @@ def matches(
         return []
     begins = np.arange(0, len(a) - width + 1, max(1, int(STRIDE_SHARE * width)))
     least = np.maximum(MOVES, alike - ALIKE) if least is None else least
-    moving = [(a[i : i + width].std(0) >= least).any() for i in begins]
-    begins = begins[np.array(moving, bool)]
+    about = (a - a.mean(0)).T
+    spread = _moving_sum(np.square(about), width) - np.square(_moving_sum(about, width)) / width
+    moving = spread[:, begins] >= width * np.square(least).reshape(-1, 1)
+    begins = begins[moving.any(axis=0)]
     lags = np.arange(-len(a) + 1, len(b))
     fits = np.zeros((len(begins), len(lags)), bool)
     apart = np.zeros((len(begins), len(lags)))
+    places = _Places(b, width, alike)
     for number, begin in enumerate(begins):
-        found = _window_misfit(a[begin : begin + width], b, alike)
+        found = places.misfit(a[begin : begin + width])
         first = len(a) - 1 - begin
         fits[number, first : first + len(found)] = found <= 1.0
         apart[number, first : first + len(found)] = found
@@ -516,22 +520,37 @@ def _on_grid(signal: RunSignal, step: float) -> np.ndarray:
     return signal.at(np.minimum(signal.t_s[0] + step * np.arange(count), signal.t_s[-1]))
 
 
-def _window_misfit(window: np.ndarray, b: np.ndarray, alike: np.ndarray) -> np.ndarray:
-    """(G - W + 1,) mean squared difference of a window (W, m) and b (G, m) from each place on.
+class _Places:
+    """A run b (G, m) at all of whose places windows of W rows are laid, of one width."""
 
-    In units of what counts as the same, of the chamber that differs most.
-    """
-    size = len(window) + len(b)
-    length = 1 << (size - 1).bit_length()
-    middle = window.mean(0)
-    x, y = window - middle, b - middle
-    cross = np.fft.irfft(
-        np.conj(np.fft.rfft(x, length, axis=0)) * np.fft.rfft(y, length, axis=0), length, axis=0
-    )[: len(b) - len(window) + 1]
-    sums = np.cumsum(np.vstack([np.zeros(y.shape[1]), np.square(y)]), axis=0)
-    moving = sums[len(window) :] - sums[: len(sums) - len(window)]
-    square = (np.square(x).sum(0) - 2 * cross + moving) / len(window)
-    return (np.maximum(square, 0.0) / np.square(alike)).max(1)
+    def __init__(self, b: np.ndarray, width: int, alike: np.ndarray):
+        self.width, self.alike = width, alike
+        scaled = (b / alike).T
+        self.middle = scaled.mean(1, keepdims=True)
+        y = scaled - self.middle
+        self.count = len(b) - width + 1
+        self.length = next_fast_len(len(b) + width - 1, real=True)
+        self.spectrum = rfft(y, self.length)
+        self.sum, self.square = (_moving_sum(each, width) for each in (y, np.square(y)))
+
+    def misfit(self, window: np.ndarray) -> np.ndarray:
+        """(G - W + 1,) mean squared difference of a window (W, m) from b at each place.
+
+        In units of what counts as the same, of the chamber that differs most.
+        """
+        scaled = (window / self.alike).T
+        mean = scaled.mean(1, keepdims=True)
+        x, shift = scaled - mean, mean - self.middle
+        cross = irfft(np.conj(rfft(x, self.length)) * self.spectrum, self.length)[:, : self.count]
+        square = self.square - 2 * shift * self.sum + self.width * np.square(shift)
+        square += np.square(x).sum(1, keepdims=True) - 2 * cross
+        return np.maximum(square.max(0), 0.0) / self.width
+
+
+def _moving_sum(x: np.ndarray, width: int) -> np.ndarray:
+    """(m, G - W + 1) sums of W successive values of x (m, G)."""
+    sums = np.cumsum(np.hstack([np.zeros((len(x), 1)), x]), axis=1)
+    return sums[:, width:] - sums[:, : sums.shape[1] - width]
 
 
 def _refined(

@@ -335,7 +335,12 @@ def residual_table(model: ArmModel, recordings: list[Recording]) -> ResidualTabl
         predicted = history.rows(taps.behind["sensor"])
         direction = history.rows(taps.direction)
     if not torch.isfinite(predicted).all():
-        raise InputError("the model predicts values that are not finite; fit it again")
+        asked, spec = history.rows(history.pressure), model.spec
+        raise InputError(
+            f"the model predicts values that are not finite for actuation from "
+            f"{float(asked.min()):.4g} to {float(asked.max()):.4g} {spec.unit}; it was fitted to "
+            f"{min(spec.low):.4g} to {max(spec.high):.4g}. Check the unit, or fit it again"
+        )
     noise, source = noise_of(recordings)
 
     def each(pick, width: tuple[int, ...] = ()) -> np.ndarray:

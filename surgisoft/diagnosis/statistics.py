@@ -178,21 +178,35 @@ def cross_validated_ridge(
     rows is taken, the same for all targets and folds.
     """
     x = _standardised(design)
-    predicted = np.zeros((len(penalties), *target.shape))
+    x = np.concatenate([np.ones((len(x), 1)), x], axis=1)
+    error = np.zeros(len(penalties))
+    fits = []
     for columns in _alike(target):
         seen = ~np.isnan(target[:, columns]).any(axis=1)
         if seen.any():
-            predicted[:, :, columns] = _predict(x, target[:, columns], seen, fold, penalties)
-    error = [np.nansum(np.square(each - target)) for each in predicted]
+            weights = _ridges(x, target[:, columns], seen, fold, penalties)
+            fits.append((columns, weights))
+            for part in range(weights.shape[1]):
+                rows = np.flatnonzero(fold == part)
+                rows = rows[~np.isnan(target[np.ix_(rows, columns)]).all(axis=1)]
+                left = x[rows] @ weights[:, part] - target[np.ix_(rows, columns)]
+                error += np.nansum(np.square(left), axis=(1, 2))
     best = int(np.argmin(error))
-    return HeldOut(predicted[best], penalties[best])
+    predicted = np.zeros_like(target)
+    for columns, weights in fits:
+        for part in range(weights.shape[1]):
+            rows = np.flatnonzero(fold == part)
+            predicted[np.ix_(rows, columns)] = x[rows] @ weights[best, part]
+    return HeldOut(predicted, penalties[best])
 
 
 def _standardised(design: np.ndarray) -> np.ndarray:
     """(S, F') columns of mean 0 and variance 1; constant ones are left out."""
-    spread = design.std(axis=0)
-    kept = spread > 1e-9 * np.maximum(np.abs(design).max(axis=0, initial=0), 1e-300)
-    return (design[:, kept] - design[:, kept].mean(axis=0)) / spread[kept]
+    centred = design - design.mean(axis=0)
+    spread = np.sqrt(np.einsum("sf,sf->f", centred, centred) / len(design))
+    largest = np.maximum(design.max(axis=0, initial=0), -design.min(axis=0, initial=0))
+    kept = spread > 1e-9 * np.maximum(largest, 1e-300)
+    return centred[:, kept] / spread[kept]
 
 
 def _alike(target: np.ndarray) -> list[np.ndarray]:
@@ -206,24 +220,23 @@ def _alike(target: np.ndarray) -> list[np.ndarray]:
     return [np.flatnonzero(which == group) for group in range(which.max() + 1)]
 
 
-def _predict(x, target, seen, fold, penalties) -> np.ndarray:
-    """(P, S, k) held-out predictions of targets that miss the same rows, for P penalties."""
-    x = np.concatenate([np.ones((len(x), 1)), x], axis=1)
+def _ridges(x, target, seen, fold, penalties) -> np.ndarray:
+    """(P, folds, F, k) weights of targets that miss the same rows, by penalty and fold left out."""
     grams, moments = [], []
     for part in range(int(fold.max()) + 1):
         rows = (fold == part) & seen
         grams.append(x[rows].T @ x[rows])
         moments.append(x[rows].T @ target[rows])
     whole, moment = sum(grams), sum(moments)
-    answer = np.zeros((len(penalties), *target.shape))
+    answer = np.zeros((len(penalties), len(grams), x.shape[1], target.shape[1]))
     for part, (gram, own) in enumerate(zip(grams, moments, strict=True)):
-        rows = fold == part
-        left = max(int((seen & ~rows).sum()), 1)
+        left = max(int((seen & (fold != part)).sum()), 1)
         for number, penalty in enumerate(penalties):
             ridge = np.full(x.shape[1], penalty * left)
             ridge[0] = 1e-9 * left
-            solved = cho_solve(cho_factor(whole - gram + np.diag(ridge)), moment - own)
-            answer[number, rows] = x[rows] @ solved
+            answer[number, part] = cho_solve(
+                cho_factor(whole - gram + np.diag(ridge)), moment - own
+            )
     return answer
 
 

@@ -18,11 +18,15 @@ from surgisoft.compiled import compiled
 from surgisoft.surrogate.arm import ArmState
 from surgisoft.surrogate.effects.hysteresis import Hysteresis
 from surgisoft.surrogate.model import ArmModel
-from surgisoft.surrogate.networks import ArcChain, HawNN, rotation
+from surgisoft.surrogate.networks import MOST_STRETCH, ArcChain, HawNN, rotation
 from surgisoft.threads import over_rows
 
 LANES = 16
 """Numbers of float32 in the widest vectors of x86-64 (AVX-512)."""
+
+
+_MOST_STRETCH = np.float32(MOST_STRETCH)
+"""The bound of `networks.stretched` in single precision, as a compiled loop takes it."""
 
 
 class CompiledStep:
@@ -311,6 +315,7 @@ def _add_arcs(x, table, length_mm, offset_mm, base_mm, base_turn, points_mm):
             along = math.sin(angle) / angle
             across = math.sin(half * angle) / (half * angle)
             across *= half * across
+            stretch = min(max(stretch, -_MOST_STRETCH), _MOST_STRETCH)
             length = length_mm[a] * math.exp(stretch)
             ahead_x, ahead_y, ahead_z = across * bend_x, across * bend_y, along
             # The rotation about (-y, x, 0), column by column.

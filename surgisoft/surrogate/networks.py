@@ -18,6 +18,9 @@ from surgisoft.surrogate.scan import linear_scan
 
 HIDDEN = (128, 128, 128, 128)
 """Best of the paper's six architectures: 4 hidden layers of 128 neurons."""
+MOST_STRETCH = math.log(10.0)
+"""Largest logarithm of an arc's length over its length at rest, and of its inverse. No arm gets so
+long; actuation in another unit than the model's would make lengths that are no numbers."""
 
 
 def parse_widths(text: str) -> tuple[int, ...]:
@@ -29,6 +32,11 @@ def parse_widths(text: str) -> tuple[int, ...]:
     if not widths or min(widths) < 1:
         raise InputError(f"hidden widths '{text}': expected whole numbers such as 128,128,128,128")
     return widths
+
+
+def stretched(stretch: Tensor) -> Tensor:
+    """Length of an arc over its length at rest, from the logarithm of it (...)."""
+    return stretch.clamp(-MOST_STRETCH, MOST_STRETCH).exp()
 
 
 class HawNN(nn.Module):
@@ -326,7 +334,7 @@ class ConstantCurvature(nn.Module):
         on = self._sections_of_points() if self._on is None else self._on
         for section in range(self.sections):
             bend = values[..., section, :2]
-            length = self.length / self.sections * values[..., section, 2].exp()
+            length = self.length / self.sections * stretched(values[..., section, 2])
             for k in range(self.key_points):
                 share = self.fraction[k] * self.sections - section
                 if on[k] == section:
@@ -397,7 +405,7 @@ class ArcChain(nn.Module):
         turn = rotation(self.base_turn).expand(*x.shape[:-1], 3, 3)
         place = (self.base_mm + unit * self.base_shift).expand(*x.shape[:-1], 3)
         points = [place] if self.fixed_base else []
-        bend, length = values[..., :2], self.length_mm * values[..., 2].exp()
+        bend, length = values[..., :2], self.length_mm * stretched(values[..., 2])
         shape = arc_shape(bend)
         steps, turns = arc_point(bend, length, shape)[..., None], arc_rotation(bend, shape)
         for step, bent, offset in zip(

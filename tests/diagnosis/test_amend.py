@@ -150,7 +150,7 @@ def test_a_clean_recording_is_refused(lab, capsys):
     before = hashes(lab)
     command = ["amend", str(lab / "arm"), "--effect", "creep", "--data", str(lab / "clean.parquet")]
     assert run([*command, "-o", str(lab / "refused")]) == 1
-    assert "no fall of the error is claimed" in capsys.readouterr().out
+    assert "no reduction of the error is claimed" in capsys.readouterr().out
     assert hashes(lab) == before
     assert run([*command, "-o", str(lab / "anyway"), "--anyway"]) == 1
     assert load_model(lab / "anyway").effects["creep"].amount.abs() < 0.02
@@ -284,7 +284,7 @@ def test_a_fall_that_chance_or_the_fit_explains_is_not_claimed():
     assert seen.significant
     assert not seen.claimed
     assert "fitted to 30% of the held-out rows" in seen.sentence
-    assert seen.sentence.endswith("(fall 0.200 mm, 95 % 0.100 to 0.300; floor 0.200 mm)")
+    assert seen.sentence.endswith("(reduction 0.200 mm, 95 % 0.100 to 0.300; floor 0.200 mm)")
     assert replace(fall, in_fit=None).claimed
     near = Fall(1.0, 0.996, 0.99, fall=0.004, ci95=(0.001, 0.01), rows=9, blocks=3)
     assert not near.claimed

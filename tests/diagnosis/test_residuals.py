@@ -1,9 +1,11 @@
 """The model's own error is the validated one without the noise of its validation."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from surgisoft.diagnosis import data_quality
 from surgisoft.diagnosis.data_quality import thinning_notes
@@ -140,3 +142,15 @@ def test_a_long_recording_is_thinned_and_the_note_says_so(monkeypatch):
     monkeypatch.setattr(data_quality, "LONG_ROWS", 6000)
     (note,) = thinning_notes(problem)
     assert note.startswith("6,000 rows are thinned: effects are fitted to 2,000 of them")
+
+
+def test_predictions_that_are_no_numbers_are_refused_with_the_range_of_the_actuation():
+    model = still_model()
+    with torch.no_grad():
+        next(model.network.parameters()).fill_(torch.nan)
+    pressure = 1000.0 * walk(50)
+    low, high = f"{pressure.min():.4g}", f"{pressure.max():.4g}"
+    fitted = f"{min(model.spec.low):.4g} to {max(model.spec.high):.4g}"
+    expected = f"from {low} to {high} {model.spec.unit}; it was fitted to {fitted}. Check the unit"
+    with pytest.raises(InputError, match=re.escape(expected)):
+        residual_table(model, [recording(np.zeros(50), pressure)])

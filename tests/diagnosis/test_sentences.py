@@ -60,7 +60,9 @@ def amendment(**fields) -> Amendment:
 
 
 CHANGE = SimpleNamespace(before=("monday", "tuesday"))
-NUMBERS = "0.500 to 0.200 mm on held-out data (fall 0.300 mm, 95 % 0.100 to 0.400; floor 0.100 mm)"
+NUMBERS = (
+    "0.500 to 0.200 mm on held-out data (reduction 0.300 mm, 95 % 0.100 to 0.400; floor 0.100 mm)"
+)
 
 
 @pytest.mark.parametrize(
@@ -69,9 +71,9 @@ NUMBERS = "0.500 to 0.200 mm on held-out data (fall 0.300 mm, 95 % 0.100 to 0.40
         ({}, f"creep: error reduced from {NUMBERS}"),
         (
             {"retuned": True},
-            "creep: error reduced from 0.500 to 0.150 mm on held-out data (fall 0.350 mm, 95 % "
-            "0.100 to 0.400; floor 0.100 mm), with the network's last layer re-tuned; 0.200 mm "
-            "with the effects alone",
+            "creep: error reduced from 0.500 to 0.150 mm on held-out data (reduction 0.350 mm, "
+            "95 % 0.100 to 0.400; floor 0.100 mm), with the network's last layer re-tuned; "
+            "0.200 mm with the effects alone",
         ),
         (
             {"retuned": True, "alone": fall(ci95=(-0.1, 0.4))},
@@ -87,7 +89,7 @@ NUMBERS = "0.500 to 0.200 mm on held-out data (fall 0.300 mm, 95 % 0.100 to 0.40
         ),
         (
             {"alone": fall(ci95=(-0.1, 0.4))},
-            "creep: no fall of the error is claimed: 0.500 to",
+            "creep: no reduction of the error is claimed: 0.500 to",
         ),
         (
             {"change": CHANGE, "model_error": fall(2.0, 1.5)},
@@ -95,7 +97,7 @@ NUMBERS = "0.500 to 0.200 mm on held-out data (fall 0.300 mm, 95 % 0.100 to 0.40
         ),
         (
             {"change": CHANGE, "model_error": fall(2.0, 1.5), "alone": fall(ci95=(-0.1, 0.4))},
-            "creep: no fall of the unexplained change since monday + tuesday is claimed: 0.500 to",
+            "creep: no reduction of the unexplained change since monday + tuesday is claimed: ",
         ),
         (
             {"refit": object()},
@@ -107,7 +109,7 @@ NUMBERS = "0.500 to 0.200 mm on held-out data (fall 0.300 mm, 95 % 0.100 to 0.40
         ),
         (
             {"refit": object(), "alone": fall(ci95=(-0.1, 0.4))},
-            "no fall of the error is claimed for the effects: the network alone, trained for as m",
+            "no reduction of the error is claimed for the effects: the network alone, trained for ",
         ),
     ],
 )
@@ -472,11 +474,11 @@ def test_the_page_of_an_amendment_has_the_words_of_its_sentence():
     facts, parameters = amend_page(made, "t", "a").parts[:2]
     shown = dict(facts.items)
     assert shown["after, network re-tuned"] == "0.150 mm"
-    assert shown["fall, 95 %, network re-tuned"] == "0.300 to 0.400 mm"
-    assert shown["fall, 95 %, effects alone"] == "0.100 to 0.400 mm"
-    assert shown["fall, 95 %, network re-tuned"][:-3] in made.sentence
+    assert shown["reduction, 95 %, network re-tuned"] == "0.300 to 0.400 mm"
+    assert shown["reduction, 95 %, effects alone"] == "0.100 to 0.400 mm"
+    assert shown["reduction, 95 %, network re-tuned"][:-3] in made.sentence
     ((*_, plausible, source),) = parameters.parts[0].rows
     assert (plausible, source) == ("0.1 to 2000: outside", "the elements")
     plain = dict(amend_page(replace(made, retuned=False), "t", "a").parts[0].items)
-    assert plain["fall, 95 %"] == "0.300 to 0.400 mm"
-    assert "fall, 95 %, effects alone" not in plain
+    assert plain["reduction, 95 %"] == "0.300 to 0.400 mm"
+    assert "reduction, 95 %, effects alone" not in plain

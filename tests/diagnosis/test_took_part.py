@@ -136,7 +136,7 @@ def test_amend_claims_no_fall_on_rows_of_the_fit(model, seen, sure, other, tmp_p
     assert not sure.claimed
     assert replace(sure, in_fit=0.0).claimed
     assert sure.sentence.startswith(
-        "no fall on unseen data is claimed, because the model had been fitted to 100%"
+        "no reduction on unseen data is claimed, because the model had been fitted to 100%"
     )
     assert seen.to_json()["error_mm"]["held_out"] is False
     page = write_page(amend_page(seen, "t", "a"), tmp_path / "page.html").read_text()
@@ -150,7 +150,7 @@ def test_improve_claims_it_where_the_network_was_trained_together(model, sure):
     step = Round("identified", "", "creep", (), 0.9, 1.0, 1.0)
     found = Improvement(model, (step,), (), sure, (None, None), 0.0)
     assert not found.claimed
-    assert "no fall on unseen data is claimed" in found.sentence
+    assert "no reduction on unseen data is claimed" in found.sentence
     together = replace(found, rounds=(replace(step, together=True),))
     assert together.claimed
     assert "none of these errors is on unseen data" in together.sentence

@@ -194,9 +194,24 @@ def test_the_network_adds_to_its_prior_mean():
     assert torch.allclose(ensemble.each(pressure, direction)[1], expected, atol=1e-4)
 
 
+def test_actuation_in_another_unit_makes_an_arm_ten_times_as_long_and_no_longer():
+    """A chamber that stretches the arm by a twentieth at 50 kPa, asked with the same number of Pa:
+    exp(1000 * 0.05) is no length, and its key points would be no numbers in single precision."""
+    prior = ArcChain(LOW, HIGH, 3, 2)
+    prior.set_rest(torch.tensor([[0.0, 0.0, 20.0 * k] for k in range(3)]))
+    with torch.no_grad():
+        prior.table[:, 2, 0] = 0.025
+        asked = torch.tensor([[25.0, 25.0], [50.0, 25.0], [1e6, 25.0], [-1e6, 25.0]])
+        tip = prior(asked)[:, -1]
+    expected = 40.0 * np.array([1.0, np.exp(0.025), 10.0, 0.1])
+    np.testing.assert_allclose(tip[:, 2].numpy(), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [1.0, 15.0])
 @pytest.mark.parametrize(("key_points", "arcs"), [(2, 2), (3, 2), (6, 5)])
 @pytest.mark.parametrize("effects", [(), ("hysteresis",)])
-def test_the_compiled_step_adds_the_same_arcs(key_points, arcs, effects):
+def test_the_compiled_step_adds_the_same_arcs(key_points, arcs, effects, scale):
+    """scale: actuation over its range; beyond it the arcs do not get longer without limit."""
     random = torch.Generator().manual_seed(arcs)
     spec = ArmSpec(2, key_points, (0.0, 0.0), (50.0, 50.0), band=(0.5, 0.5))
     rest = torch.tensor([[0.0, 0.0, 20.0 * (k + key_points - arcs)] for k in range(key_points)])
@@ -215,7 +230,7 @@ def test_the_compiled_step_adds_the_same_arcs(key_points, arcs, effects):
     pressure = np.zeros((1, 2), np.float32)
     lone = compiled.alone(alone, pressure)
     for _ in range(5):
-        ahead = 50.0 * torch.rand(7, 2, generator=random)
+        ahead = 50.0 * scale * torch.rand(7, 2, generator=random)
         found = compiled(state, ahead)[1]
         pressure[:] = ahead[:1].numpy()
         lone.step()

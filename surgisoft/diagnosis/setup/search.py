@@ -96,7 +96,11 @@ class Proof:
     """Corrections whose errors differ by less than this factor do equally well: the simplest of
     them is named, and those of its number of kinds are named together."""
     blocks: float = 0.9
-    """Least share of the blocks of time whose error falls, of those with a noticed error."""
+    """Least share of the blocks of time whose error falls, of those with a noticed error that the
+    correction changes."""
+    changed: float = 0.05
+    """Least change of a block's RMS error, as a share of it, that counts: where the wrong channel
+    rests, the correction changes nothing but the fit of a small misalignment."""
     lag_t: float = 3.0
     """By how many standard errors, over blocks of time, the logarithm of the error must be less
     with a pure delay than with any lag, alone or behind a quarter of the delay."""
@@ -630,10 +634,12 @@ class Search:
         most = max(asked.near_validated * self.levels.reference, asked.left_of_motion * motion)
         # A fault need not show in a block in which nothing moves.
         counted = (after.blocks.count > 0) & (before.blocks.count > 0)
-        noticed = before.losses > self.limit_mm**2 * before.blocks.count
-        falls = after.losses < before.losses
-        known = after.hypothesis.mm_per_unit != 1.0 or not (counted & noticed).any()
-        share = 1.0 if known else float(np.mean(falls[counted & noticed]))
+        counted &= before.losses > self.limit_mm**2 * before.blocks.count
+        known = after.hypothesis.mm_per_unit != 1.0 or not counted.any()
+        rms = np.sqrt(np.stack([before.losses, after.losses])[:, counted])
+        shown = np.abs(rms[1] - rms[0]) >= asked.changed * rms[0]
+        falls = (rms[1] < rms[0])[shown]
+        share = 1.0 if known else float(np.mean(falls)) if shown.any() else 0.0
         return enough and after.rmse_mm <= most and share >= asked.blocks
 
     def _pure_delay(self, given: Fitted) -> bool:

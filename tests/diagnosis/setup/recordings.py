@@ -17,11 +17,15 @@ STEP_S = 0.1
 
 
 @lru_cache(maxsize=4)
-def predicted(rows: int = 2400, seed: int = 0) -> Recording:
-    """What the default model predicts for ramps and rests of all chambers, without noise."""
+def predicted(rows: int = 2400, seed: int = 0, rests: int = 0) -> Recording:
+    """What the default model predicts for ramps and rests of all chambers, without noise.
+
+    rests: number of last rows in which the first chamber rests at no pressure.
+    """
     model = default_arm()
     low, high = np.array(model.spec.low), np.array(model.spec.high)
     actuation = low + walk(rows, 3, seed) / 10.0 * (high - low)
+    actuation[rows - rests :, 0] = 0.0
     empty = Recording(
         name="bench",
         t_s=STEP_S * np.arange(rows),

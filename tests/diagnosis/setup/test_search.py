@@ -1,5 +1,7 @@
 """What the search for set-up faults asks of an explanation before it is a fault."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -9,7 +11,7 @@ from surgisoft.diagnosis.setup.alignment import Frame, block_moments, fitted
 from surgisoft.diagnosis.setup.sample import Arrangement, samples_of
 from surgisoft.diagnosis.setup.search import Border, Fitted, Hypothesis, Levels, Search
 from surgisoft.surrogate.checkpoint import default_arm
-from tests.diagnosis.setup.recordings import late, measured, predicted, with_points
+from tests.diagnosis.setup.recordings import driven, late, measured, predicted, with_points
 
 
 @pytest.fixture(scope="module")
@@ -96,3 +98,18 @@ def test_the_error_of_an_offset_is_the_spread_of_offsets_that_are_found(model):
     later, errors = np.array(found).T
     assert 0.5 < errors.mean() / later.std(ddof=1) < 2.5
     assert abs(later.mean() - 0.3) < 2.0 * errors.mean()
+
+
+def test_a_wrong_sign_is_proved_although_the_channel_rests_where_another_error_is(model):
+    """The first channel rests at 0 in half of the time, where its sign changes nothing, and
+    the body wanders by half a millimetre all the time, which is noticed there."""
+    rested = predicted(rests=1200)
+    rows = np.arange(rested.samples)
+    wander = 0.6 * np.sin(rows / 60.0)[:, None, None] * np.array([0.0, 1.0, 0.0])
+    wrong = driven(
+        with_points(rested, rested.key_points_mm + wander), lambda p: p * [-1.0, 1.0, 1.0]
+    )
+    found = find_setup_faults(model, [replace(wrong, noise_mm=0.05)])
+    assert found is not None
+    assert found.kinds == ("chambers",)
+    assert "the sign of chamber 1 is flipped" in found.sentence

@@ -37,6 +37,9 @@ AMPLITUDES = (1.0, 2.0)
 """Amplitudes of the hidden effects."""
 HIDDEN_ROWS = 6000
 """Rows of a recording with a hidden effect."""
+LEAST_MOTION = 0.2
+"""Least RMS motion of a key point that is made dead, as a share of the largest: one that hardly
+moves anyway is no fault that shows."""
 ACTUATION_SHARE = 0.02
 """Largest RMS error of the corrected actuation, as a share of its range."""
 
@@ -173,9 +176,10 @@ def _dead_chamber(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def _dead_point(recording: Recording, rng: np.random.Generator) -> Recording:
-    """One moving key point keeps one position."""
+    """One key point that moves keeps one position: with another fault the tip may be the first."""
     points = recording.key_points_mm.copy()
-    k = rng.integers(recording.key_points // 2, recording.key_points)
+    motion = np.sqrt(np.nanvar(points, axis=0).sum(1))
+    k = rng.choice(np.flatnonzero(motion >= LEAST_MOTION * motion.max()))
     points[:, k] = points[np.flatnonzero(np.isfinite(points[:, k, 0]))[0], k]
     return _with_points(recording, points)
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 
 from surgisoft.errors import InputError
 from surgisoft.surrogate import ensemble
@@ -418,6 +419,65 @@ def test_auto_tries_the_effects_that_ask_for_it(monkeypatch):
             if warning.startswith("no effect with memory added"):
                 found |= set(re.findall(r"(\w+) \d+\.\d{3}", warning))
         assert found - {"none"} == tried
+
+
+def prescribed(monkeypatch, aside):
+    """Training that makes every network a constant, so many mm aside along x by its label."""
+
+    def trained(model, data, label, *_):
+        model.network.scale.zero_()
+        offset = torch.tensor([aside.get(label, 1.0), 0.0, 0.0])
+        model.network.mean.copy_(offset.repeat(SPEC.key_points))
+        return 1
+
+    monkeypatch.setattr("surgisoft.surrogate.fit.train_model", trained)
+
+
+def at(aside):
+    """One run of an arm whose key points are so many mm (T,) aside along x."""
+    t = torch.arange(len(aside)) * 0.1
+    points = torch.zeros(len(aside), SPEC.key_points, 3)
+    points[..., 0] = torch.as_tensor(aside, dtype=torch.float32)[:, None]
+    command = torch.tensor(walk(len(aside), np.random.default_rng(0)))
+    return pack([t], [command], [points])
+
+
+@pytest.mark.parametrize(
+    ("blocks", "t", "kept"), [(8, 2.2, False), (8, 2.5, True), (4, 99.0, False), (5, 99.0, True)]
+)
+def test_a_stage_is_kept_by_a_t_test_over_blocks_of_time(monkeypatch, blocks, t, kept):
+    """Of blocks of 25 rows whose squared error falls by 1 mm^2 on average, with this t of Student.
+
+    The critical value of eight blocks is 2.36; four are too few whatever they say.
+    """
+    spread = np.linspace(-1.0, 1.0, blocks)
+    gain = 1.0 + spread / spread.std(ddof=1) * np.sqrt(blocks) / t
+    assert stats.ttest_1samp(gain, 0.0).statistic == pytest.approx(t)
+    prescribed(monkeypatch, {"direction": 0.0})
+    # The squared distance to 1 less that to 0 is 1 - 2 x.
+    valid = at(np.repeat((1.0 - gain) / 2.0, 25))
+    config = FitConfig(hidden=(4,), prior="none", check_excitation=False)
+    stage = fit(at(np.zeros(100)), valid, SPEC, config).stages[-1]
+    assert (stage.name, stage.kept) == ("direction", kept)
+
+
+@pytest.mark.parametrize(
+    ("aside", "added"),
+    [
+        ({"creep": 0.96, "line_lag": 0.97}, []),
+        ({"creep": 0.94, "line_lag": 0.97}, ["creep"]),
+        ({"creep": 0.8, "line_lag": 0.7, "hysteresis": 0.6, "rate_dependence": 0.9},
+         ["hysteresis", "line_lag"]),
+    ],
+)  # fmt: skip
+def test_auto_adds_two_effects_at_most_of_a_tenth_of_the_squared_error(monkeypatch, aside, added):
+    prescribed(monkeypatch, aside)
+    config = FitConfig(
+        hidden=(4,), prior="none", inputs="pressure", effects=("auto",), check_excitation=False
+    )
+    result = fit(at(np.zeros(100)), at(np.zeros(250)), SPEC, config)
+    assert [stage.name for stage in result.stages[1:]] == added
+    assert sorted(result.model.effects) == sorted(added)
 
 
 @pytest.mark.parametrize(

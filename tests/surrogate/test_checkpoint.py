@@ -3,7 +3,6 @@
 import json
 import os
 import stat
-from dataclasses import replace
 
 import pytest
 import torch
@@ -44,18 +43,6 @@ def test_all_that_a_model_knows_of_its_error_comes_back(tmp_path):
     arm.validation = Validation()
     save_model(arm, tmp_path / "new")
     assert load_model(tmp_path / "new").validation == Validation()
-
-
-def test_an_interval_of_one_growth_is_one_of_that_growth_at_each_key_point(tmp_path):
-    """As models had it before each key point got its own."""
-    arm = default_arm()
-    arm.validation = replace(arm.validation, interval=INTERVAL)
-    save_model(arm, tmp_path / "arm")
-    file = tmp_path / "arm" / "config.json"
-    config = json.loads(file.read_text())
-    config["interval"]["growth"] = 2.0
-    file.write_text(json.dumps(config))
-    assert load_model(tmp_path / "arm").validation.interval == INTERVAL
 
 
 def test_a_shape_at_rest_of_other_key_points_is_refused(tmp_path):

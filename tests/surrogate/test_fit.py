@@ -15,7 +15,7 @@ from surgisoft.surrogate.effects import hypothesis_of
 from surgisoft.surrogate.effects.twist import Twist
 from surgisoft.surrogate.fit import FitConfig, excitation, fit
 from surgisoft.surrogate.history import pack
-from surgisoft.surrogate.interval import calibrate, coverage_of
+from surgisoft.surrogate.interval import ErrorInterval, calibrate, coverage_of
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import HawEnsemble, HawNN, range_weights, weighted_mse
 from surgisoft.surrogate.training import (
@@ -459,6 +459,43 @@ def test_a_stage_is_kept_by_a_t_test_over_blocks_of_time(monkeypatch, blocks, t,
     config = FitConfig(hidden=(4,), prior="none", check_excitation=False)
     stage = fit(at(np.zeros(100)), valid, SPEC, config).stages[-1]
     assert (stage.name, stage.kept) == ("direction", kept)
+
+
+def test_the_radii_of_an_ensemble_are_those_of_its_mean(monkeypatch):
+    """Members 1 and 3 mm aside: their mean is 2 mm off, a single one sqrt(5) mm, RMS."""
+    prescribed(monkeypatch, {})
+    apart = ErrorInterval((0.95,), ((2.0,) * 3,), (0.0,) * 3, 250, 10, "cross-validation")
+
+    def trained(model, *_):
+        made = HawEnsemble.of([model.network, model.network])
+        for values in (*made.weights, *made.biases):
+            values.data.zero_()
+        made.scale.fill_(1.0)
+        made.mean.zero_()
+        for member, aside in enumerate((1.0, 3.0)):
+            made.biases[-1].data[member, 0] = torch.tensor([aside, 0.0, 0.0] * SPEC.key_points)
+        return model.replace(network=made), apart
+
+    monkeypatch.setattr("surgisoft.surrogate.fit.train_ensemble", trained)
+    config = FitConfig(hidden=(4,), prior="none", inputs="pressure", members=2)
+    result = fit(at(np.zeros(100)), at(np.zeros(250)), SPEC, config)
+    assert result.stages[-1].valid_rmse_mm == pytest.approx(2.0)
+    (radii,) = result.model.validation.interval.quantiles_mm
+    assert radii == pytest.approx([2.0 * np.sqrt(4.0 / 5.0)] * 3)
+
+
+def test_a_fit_keeps_residuals_of_both_recordings_and_notes_what_hardly_moved(monkeypatch):
+    """The validation recording is 2 mm aside; chamber 2 moves by a tenth of its range."""
+    prescribed(monkeypatch, {"pressure": 0.0})
+    train, valid = at(np.zeros(100)), at(np.full(100, 2.0))
+    share = torch.linspace(0.0, 1.0, 100)[:, None] * torch.tensor([0.2, 0.1, 1.0])
+    low, span = torch.tensor(SPEC.low), torch.tensor(SPEC.span)
+    train.pressure[0] = low + share * span
+    config = FitConfig(hidden=(4,), prior="none", inputs="pressure", check_excitation=False)
+    result = fit(train, valid, SPEC, config)
+    assert set(np.unique(np.asarray(result.known.residual_mm)[..., 0]).round(4)) == {0.0, 2.0}
+    (note,) = [each for each in result.warnings if "hardly moved" in each]
+    assert note.startswith(f"chamber 2 hardly moved ({0.1 * float(span[1]):.3g} kPa in all)")
 
 
 @pytest.mark.parametrize(

@@ -52,6 +52,8 @@ def test_a_module_of_the_working_folder_is_found(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [p for p in sys.path if p])
     assert open_rig("bench_of_mine:make:robot=4").config.seed == 4
+    with pytest.raises(InputError, match="'highest' is a safety limit of real rigs, and this one"):
+        open_rig("bench_of_mine:make:robot=4,highest=20")
 
 
 def test_a_rig_of_another_package(tmp_path, monkeypatch):

@@ -6,7 +6,15 @@ import pytest
 from surgisoft.diagnosis import diagnose as diagnosing
 from surgisoft.diagnosis.compare import compare
 from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Verdict
-from surgisoft.diagnosis.error_axes import AXES, AxisShare, gravity_angle, known, shares
+from surgisoft.diagnosis.error_axes import (
+    AXES,
+    AxisShare,
+    bands,
+    gravity_angle,
+    known,
+    lag,
+    shares,
+)
 from surgisoft.diagnosis.residuals import problem_of, residual_table
 from tests.diagnosis.synthetic import (
     POINTS,
@@ -138,6 +146,60 @@ def test_angle_to_the_weight():
         points[-1, :2] += bend
         rest.predicted_mm[:] = points
         assert gravity_angle(rest) == pytest.approx(np.full(20, angle), abs=1e-6)
+
+
+def test_a_weight_along_the_arm_has_no_side():
+    """A twentieth of the weight pulls sideways: less than tells a side."""
+    down = np.array([0.05, 0.0, np.sqrt(1 - 0.05**2)])
+    table = residual_table(still_model(), [recording(np.zeros(20), walk(20), gravity=down)])
+    table.predicted_mm[:, -1, 0] += 3.0
+    assert np.isnan(gravity_angle(table)).all()
+
+
+def test_the_lag_is_what_the_low_pass_has_not_reached_yet():
+    """After a step of 6 from rest 6 exp(-t / 0.5 s), and as much below it after the way back."""
+    pressure = np.zeros((120, 2))
+    pressure[40:80, 0] = 6.0
+    table = residual_table(still_model(), [recording(np.zeros(120), pressure)])
+    found = lag(table)[:, 0]
+    assert found[:40] == pytest.approx(0.0, abs=1e-6)
+    waited = np.exp(-0.1 * np.arange(10) / 0.5)
+    assert found[45:55] / found[45] == pytest.approx(waited, rel=1e-4)
+    assert 6.0 * np.exp(-1.2) < found[45] < 6.0 * np.exp(-1.0)
+    assert found[80:120] == pytest.approx(-found[40:80], abs=0.01)
+
+
+def test_bands_of_a_direction_are_the_rows_that_rise_and_those_that_fall():
+    """50 rows at rest, 100 up and 100 down, in which the tip is 2 mm aside: one point of three."""
+    up = np.linspace(0.0, 10.0, 101)[1:]
+    one = np.concatenate([np.zeros(50), up, up[::-1]])
+    effect = np.concatenate([np.zeros(152), np.full(98, 2.0)])
+    made = recording(effect, np.stack([one, one], axis=1))
+    found = [b for b in bands(problem_of(still_model(), [made])) if b.axis == "direction 1"]
+    assert [band.label for band in found] == ["rising", "falling"]
+    rising, falling = found
+    assert rising.samples == pytest.approx(101, abs=3)
+    assert falling.samples == pytest.approx(98, abs=3)
+    assert rising.rmse_mm < 0.2
+    assert falling.rmse_mm == pytest.approx(2.0 / np.sqrt(3), rel=0.03)
+
+
+def test_bands_along_the_arm_are_named_by_their_way_from_the_base():
+    """The key points of a straight arm are 5, 30 and 70 mm from the base, the last one 2 mm off."""
+    made = recording(np.full(200, 2.0), walk(200))
+    found = [b for b in bands(problem_of(still_model(), [made])) if b.axis == "arc length"]
+    assert [band.label for band in found] == ["5 mm", "30 mm", "70 mm"]
+    assert [(band.low, band.high) for band in found] == [(5.0, 5.0), (30.0, 30.0), (70.0, 70.0)]
+    assert [band.rmse_mm for band in found] == pytest.approx([0.09, 0.09, 2.0], rel=0.1)
+
+
+def test_where_actuation_explains_nothing_memory_is_judged_by_the_error_itself():
+    """Of noise a regression on the actuation leaves more than there was, held out."""
+    problem = problem_of(still_model(), [recording(np.zeros(600), walk(600))])
+    square = np.square(problem.table.error_mm).mean()
+    profile = next(each for each in shares(problem) if each.axis == "rate").profiles[0]
+    without = np.average(np.square(profile.without_mm), weights=profile.rows)
+    assert without == pytest.approx(square, rel=1e-6)
 
 
 @pytest.mark.parametrize(("chambers", "points"), [(1, POINTS[-1:]), (6, POINTS), (4, POINTS[1:])])

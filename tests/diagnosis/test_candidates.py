@@ -1,10 +1,13 @@
 """Columns against differences of the whole model's predictions."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
-from surgisoft.diagnosis.candidates import candidates, copied, with_effect
+from surgisoft.diagnosis.candidates import candidates, copied, facts_of, with_effect
 from surgisoft.diagnosis.residuals import held_out_rows, problem_of
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import Recording
@@ -33,6 +36,21 @@ def pressurised(recording):
     names = ("t_s", "measured", "key_points_mm")
     cut = Recording("cut", **{name: getattr(recording, name)[rows] for name in names})
     return problem_of(default_arm(), [cut], rows=400)
+
+
+def test_a_room_that_was_warm_all_along_is_the_room_of_the_model():
+    """Where the model does not say how warm it was: the mean of what was measured."""
+    plain = replace(default_arm().facts, temperature_C=None)
+    warm = SimpleNamespace(temperature_C=torch.tensor([[20.0, torch.nan, 25.0]]))
+    unknown = SimpleNamespace(temperature_C=None)
+    for stated, history, expected in (
+        (None, warm, 22.5),
+        (30.0, warm, 30.0),
+        (None, unknown, None),
+    ):
+        model = SimpleNamespace(facts=replace(plain, temperature_C=stated))
+        found = facts_of(SimpleNamespace(model=model, history=history))
+        assert found == replace(plain, temperature_C=expected)
 
 
 @pytest.mark.parametrize("name", sorted(EFFECTS))

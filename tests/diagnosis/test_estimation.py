@@ -24,15 +24,20 @@ from surgisoft.diagnosis.estimation.intervals import (
     with_covariance,
 )
 from surgisoft.diagnosis.estimation.least_squares import (
+    AMPLITUDES,
     Fit,
     Prediction,
+    amplitude_sensitivities,
+    block_slopes,
+    fit_all,
+    fit_amplitudes,
     free_parameters,
     repeated_scan,
     vector,
 )
 from surgisoft.diagnosis.estimation.network import best_layer, retune
 from surgisoft.diagnosis.estimation.network_error import NetworkError
-from surgisoft.diagnosis.estimation.nuisance import Nuisance, kinds
+from surgisoft.diagnosis.estimation.nuisance import Nuisance, held_out_parts, kinds
 from surgisoft.diagnosis.pages.amendment import parameter_parts
 from surgisoft.diagnosis.residuals import problem_of
 from surgisoft.errors import InputError
@@ -194,6 +199,75 @@ def test_forward_is_the_model_and_its_slopes_are_those_of_autograd():
         (exact,) = torch.autograd.grad(total, parameter)
         parameter.requires_grad_(False)
         assert slopes[..., 0, place].sum() == pytest.approx(float(exact), rel=0.02)
+
+
+def test_a_slope_is_by_the_step_that_a_parameter_in_single_precision_takes():
+    """At 20 m of motion per unit a step of a millionth is taken: 8 units of the last place of 1."""
+    parameter = torch.ones(1)
+    predict = Prediction(lambda: 2e4 * (parameter.double() - 1.0).view(1, 1, 1), {"x": parameter})
+    slopes = predict.sensitivities(np.ones(1), predict(np.ones(1)))
+    assert predict.steps.item() == pytest.approx(1e-6)
+    assert slopes.item() == pytest.approx(2e4, rel=1e-6)
+    assert parameter.item() == 1.0
+
+
+def test_the_likelihood_of_a_fit_by_hand():
+    """Fifty rows count as one: of 200 with a misfit of 10 mm^2 each has 2.5 mm^2."""
+    fit = replace(fit_of([1.0], np.zeros((200, 1, 3, 1)), np.zeros((200, 1, 3))), misfit=12.0)
+    assert fit.likelihood(10.0) == pytest.approx(np.exp(-2.0 / (2.0 * 2.5)))
+    assert fit.likelihood(12.0) == fit.likelihood(13.0) == 1.0
+
+
+def test_a_fit_ends_where_the_slope_of_the_misfit_is_that_of_the_hold():
+    """Few rows of a small creep say little of its times, which a spread of 1.5 holds at their
+    start; a unit of it costs as much as one sample of 50 rows."""
+    small = with_truth("creep", {"amount": [0.02], "log_tau": [2.0], "log_width": [0.3]})
+    problem = problem_of(bare_arm(), [measured_on(small, runs=2, rows=60)], part="all")
+    model = with_truth("creep", {"amount": [0.02], "log_tau": [2.6], "log_width": [0.5]})
+    start = vector(free_parameters(model, ["creep"]))
+    first = problem.with_model(model).residual
+    fit = fit_all(model, problem, ["creep"])
+    nonlinear = np.arange(len(start)) >= len(vector(model.effects["creep"].amplitudes()))
+    spread = 1.5 * np.maximum(1.0, np.abs(start))
+    assert fit.prior_variance == pytest.approx(np.where(nonlinear, spread**2, 0.0))
+    sample = 50.0 * fit.nuisance.misfit(first) / len(first)
+    expected = np.diag(np.where(nonlinear, sample / spread**2, 0.0))
+    np.testing.assert_allclose(fit.hold, expected, rtol=1e-3)
+    away = fit.values - start
+    assert np.abs(away).max() > 0.02
+    left = fit.nuisance.misfit(fit.residual)
+    assert fit.misfit == pytest.approx(left + away @ fit.hold @ away, rel=1e-9)
+    grams, slopes = block_slopes(fit, np.zeros(len(first)))
+    step = np.linalg.solve(grams[0] + fit.hold, slopes[0] - fit.hold @ away)
+    assert np.abs(step).max() < 0.1 * np.abs(away).max()
+
+
+def test_the_ridge_of_amplitudes_is_the_one_that_does_best_on_runs_left_out():
+    """Where the static error counts for nothing: plain least squares of the other runs."""
+    truth = default_arm()
+    weaker = copy.deepcopy(truth)
+    for strength in weaker.effects["hysteresis"].amplitudes().values():
+        strength.mul_(0.5)
+    problem = problem_of(weaker, [measured_on(truth, rows=80)], part="all")
+    problem = replace(problem, discrepancy_mm=np.full(5, 1e-3))
+    forward = repeated_scan(weaker, problem, ["hysteresis"])
+    jacobian = amplitude_sensitivities(weaker, forward, "hysteresis")
+    start, count = vector(weaker.effects["hysteresis"].amplitudes()), jacobian.shape[-1]
+    part, residual = held_out_parts(problem), problem.residual
+    assert len(np.unique(part)) >= 3
+    along = start / np.linalg.norm(start)
+    penalty = np.eye(count) - (1 - AMPLITUDES.along_present) * np.outer(along, along)
+    penalty *= np.square(jacobian).sum() / count
+    errors = np.zeros(len(AMPLITUDES.ridges))
+    for left_out in np.unique(part):
+        others, own = part != left_out, part == left_out
+        a, b = jacobian[others].reshape(-1, count), jacobian[own].reshape(-1, count)
+        for i, ridge in enumerate(AMPLITUDES.ridges):
+            change = np.linalg.solve(a.T @ a + ridge * penalty, a.T @ residual[others].ravel())
+            errors[i] += np.square(residual[own].ravel() - b @ change).sum()
+    fit = fit_amplitudes(weaker, problem, "hysteresis")
+    chosen = np.trace(fit.hold) / np.trace(penalty)
+    assert chosen == pytest.approx(AMPLITUDES.ridges[errors.argmin()], rel=0.1)
 
 
 def test_hysteresis_that_the_model_has_is_fitted_anew_not_doubled():

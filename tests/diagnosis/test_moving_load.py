@@ -4,13 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from scipy.signal import lsim, lti
 
-from surgisoft.diagnosis.candidates import candidates
+from surgisoft.diagnosis.candidates import Mode, candidates, measured_candidates, with_effect
 from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.diagnosis.pairs import before_and_after
 from surgisoft.diagnosis.residuals import residual_table
 from surgisoft.measurement.recordings import Recording
+from surgisoft.surrogate.effects import make_effect
 from surgisoft.surrogate.model import Validation
 from tests.diagnosis.synthetic import POINTS, still_model
 
@@ -122,6 +124,22 @@ def left_by(problem, candidate):
     return np.std(change - sensitivities @ amplitudes) / np.std(change), amplitudes[0]
 
 
+def test_a_mode_follows_a_sine_by_its_transfer_function(model):
+    """w^2 / (w^2 - v^2 + 2 i damping w v) for a sine of v; its acceleration is -v^2 of it."""
+    w, v, damping, dt = 2 * np.pi * 2.0, 2 * np.pi * 1.5, 0.2, 0.01
+    t = dt * np.arange(2000)
+    push = np.stack([np.sin(v * t), np.cos(v * t)], -1)
+    given = torch.from_numpy(push[None]).float(), torch.full((1, len(t)), dt)
+    with torch.no_grad():
+        at, acceleration = Mode(2.0, damping).follow(model.facts, *given, lambda rows: rows[0])
+    wave = w**2 / (w**2 - v**2 + 2j * damping * w * v) * np.exp(1j * v * t)
+    expected = np.stack([wave.imag, wave.real], -1)
+    late = t > 10.0
+    np.testing.assert_allclose(at[late], expected[late], atol=0.01 * abs(wave[0]))
+    size = v**2 * abs(wave[0])
+    np.testing.assert_allclose(acceleration[late], -(v**2) * expected[late], atol=0.02 * size)
+
+
 def test_a_load_in_motion_explains_a_swing_that_no_model_predicts(model, unloaded, loaded):
     """Mass and weight of one load, on an arm whose model knows nothing of its motion."""
     before, after = take(unloaded, "before", 1), take(loaded, "after", 2)
@@ -134,6 +152,41 @@ def test_a_load_in_motion_explains_a_swing_that_no_model_predicts(model, unloade
     assert sag == pytest.approx(expected, rel=0.1), "sag at rest of a mass, C m g L^3 / 3"
     (gain,) = [c for c in candidates(problem, ["gain_mismatch"]) if c.spread is not None]
     assert left_by(problem, gain)[0] > 4 * best
+
+
+def test_candidates_on_the_measured_body_by_count_and_by_hand(model, unloaded, loaded):
+    """Rows of 0.05 s show four samples in a period up to 5 Hz: 6 of the frequencies, 4 dampings."""
+    before, after = take(unloaded, "before", 1), take(loaded, "after", 2)
+    problem = before_and_after(residual_table(model, [after]), [before]).training()
+    loads = measured_candidates(problem, ["payload"])
+    assert len(loads) == 1 + 6 * 4
+    assert all(load.removable for load in loads)
+    (gain,) = measured_candidates(problem, ["gain_mismatch"])
+    assert not gain.removable
+    motion = problem.table.body_before_mm[problem.index.numpy()] - POINTS
+    np.testing.assert_allclose(gain.sensitivities[..., 0], motion, atol=1e-5)
+    np.testing.assert_allclose(gain.with_amplitudes(np.array([0.1])).gain.detach(), [0.1, 0.1])
+    had = with_effect(model, "payload", make_effect("payload", model.facts))
+    assert measured_candidates(problem.with_model(had), ["payload"]) == []
+
+
+def test_a_load_along_the_body_weighs_by_its_acceleration_as_one_at_the_tip(model):
+    """A bent body that moves up and down as a whole: both loads weigh as much more or less."""
+    t = PERIOD_S * np.arange(ROWS)
+    still = take(np.full((ROWS, 2), 15.0), "before", 1)
+    rise = 0.5 * np.sin(2 * np.pi * 4.0 * t)[:, None] * np.ones(len(POINTS))
+    points = np.repeat(still.key_points_mm.mean(0)[None], ROWS, 0)
+    points[..., 2] += rise
+    before, after = (replace(still, name=name, key_points_mm=points) for name in ("a", "b"))
+    problem = before_and_after(residual_table(model, [after]), [before]).training()
+    rest, *moving = (
+        each.sensitivities[:, -1, 0] for each in measured_candidates(problem, ["payload"])
+    )
+    mode = max(moving, key=lambda each: each[..., 0].std())
+    tip, body = (mode / rest - 1.0).T
+    assert tip.std() > 0.05
+    np.testing.assert_allclose(body.std(), tip.std(), rtol=0.1)
+    assert np.corrcoef(tip, body)[0, 1] > 0.99
 
 
 def test_payload_is_found_when_it_comes_and_when_it_goes(model, unloaded, loaded):

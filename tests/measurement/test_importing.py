@@ -261,6 +261,7 @@ def test_context_constant_from_a_column_or_from_the_name(tmp_path):
         imported(tmp_path, other, content)
     content = content.replace("_(\\d+)g' }", "_(\\d+)g', otherwise = 0 }")
     assert imported(tmp_path, other, content)[0].payload_g[0] == 0
+    assert imported(tmp_path, path, content)[0].payload_g[0] == 250
 
 
 def test_sidecar_of_the_map_goes_into_the_recording(tmp_path):

@@ -40,6 +40,11 @@ MAPS = [
     ),
     (
         'column = "t"',
+        'column = "t"\nunit = "iso"\nscale = 2',
+        "time.scale: got 2; expected none beside rate_hz or dates",
+    ),
+    (
+        'column = "t"',
         'column = "t"\nunit = "days"',
         "time.unit: got text 'days'; expected one of s",
     ),
@@ -107,6 +112,28 @@ MAPS = [
     ('unit = "mm"', 'unit = "mm"\n[recording]\nkind = "live"', "kind: got text 'live'; expected o"),
     ('unit = "mm"', 'unit = "mm"\n[extra]\na = 1', "extra: unknown field; expected one of file"),
     ('unit = "mm"', "unit = 'mm", "not valid TOML"),
+    ('unit = "mm"', 'unit = "mm"\norder = [1]', "order: got a list [1]; expected each of the num"),
+    ('unit = "mm"', 'unit = "mm"\nlost = [-1]', "lost: got a list [-1]; expected numbers >= 0"),
+    (
+        'positions = [["x", "y", "z"]]',
+        'point = [{position = ["x", "y", "z"], offset = [0, 0, 5]}]',
+        "quaternion: missing; expected the body's orientation, since there is an offset",
+    ),
+    (
+        'columns = ["u"]',
+        'columns = ["u", "v", "w"]\nscale = [1, 2]',
+        "measured.scale: got a list [1.0, 2.0]; expected one number, or 3, one per channel",
+    ),
+    (
+        'unit = "mm"',
+        'unit = "mm"\n[context]\npayload_g = {column = "u", from_name = "(x)"}',
+        "payload_g: got a table; expected a number, {column = ...} or {from_name = ...}",
+    ),
+    (
+        'unit = "mm"',
+        'unit = "mm"\n[commanded]\nrepeated = "interpolate"',
+        "commanded.repeated: got text 'interpolate'; expected \"keep\": a command is held",
+    ),
 ]
 
 RAW = "t,u,x,y,z\n0,1,2,3,4\n1,2,3,4,5\n"

@@ -118,6 +118,91 @@ def test_folder_output_makes_a_recording_of_each_file(tmp_path):
         run(tmp_path, twice, TWO.replace("OFFSET", ""), name=None)
 
 
+@pytest.mark.parametrize(
+    ("zero", "runs", "alone"),
+    [("file", (0, 0), (0, 0)), ("recording", (0, 60), (0, 0)), ("none", (40, 100), (40, 100))],
+)
+def test_time_is_zero_where_each_file_or_the_recording_begins_or_as_it_is(
+    tmp_path, zero, runs, alone
+):
+    """Two files that begin at 40 s and 100 s of one clock, as runs of one recording and alone."""
+    values = np.arange(18.0).reshape(3, 6)
+    files = []
+    for start in (40.0, 100.0):
+        values[:, 0] = start + np.arange(3.0)
+        header = ["t", "u", "x", "y", "z", "w"]
+        files.append(written(tmp_path / f"a{start:g}.csv", text(values, header=header)))
+    content = ONE.replace("ROWS", "").replace("KEYS", "")
+    content = content.replace('column = "t"', f'column = "t"\nzero = "{zero}"')
+    (part,) = run(tmp_path, files, content)
+    for number, first in enumerate(runs):
+        inside = part.recording.run == number
+        np.testing.assert_allclose(part.recording.t_s[inside], first + np.arange(3.0))
+    for each, first in zip(run(tmp_path, files, content, None), alone, strict=True):
+        np.testing.assert_allclose(each.recording.t_s, first + np.arange(3.0))
+
+
+def test_the_runs_of_a_file_are_counted_on_from_those_of_the_files_before(tmp_path):
+    """Three runs in the first file, two in the second one."""
+    values, files = np.arange(36.0).reshape(6, 6), []
+    for name, seconds in (("a", [0, 1, 50, 51, 90, 91]), ("b", [0, 1, 2, 3, 70, 71])):
+        values[:, 0] = seconds
+        header = ["t", "u", "x", "y", "z", "w"]
+        files.append(written(tmp_path / f"{name}.csv", text(values, header=header)))
+    content = ONE.replace("ROWS", "").replace("KEYS", "[runs]\ngap_s = 10")
+    (part,) = run(tmp_path, files, content)
+    np.testing.assert_array_equal(part.recording.run, [0, 0, 1, 1, 2, 2, 3, 3, 3, 3, 4, 4])
+
+
+def test_runs_of_one_recording_have_one_unit(tmp_path):
+    """Units that columns have in their names: of two files, and of two channels of one."""
+    content = ONE.replace("ROWS", "").replace("KEYS", "")
+    content = content.replace('columns = ["u"]\nunit = "kPa"\n', "")
+    values, files = np.arange(21.0).reshape(3, 7), {}
+    for one, other in (("p1_kPa", "p2_kPa"), ("p1_psi", "p2_psi"), ("p1_kPa", "p2_psi")):
+        header = ["t", one, other, "x", "y", "z", "w"]
+        path = tmp_path / f"{one}{other}.csv"
+        files[one, other] = written(path, text(values, header=header))
+    in_kpa, in_psi, mixed = files.values()
+    (part,) = run(tmp_path, [in_kpa, in_kpa], content)
+    assert part.recording.unit == "kPa"
+    with pytest.raises(InputError, match=r"2 channels in psi and .* expected 2 in kPa and 2"):
+        run(tmp_path, [in_kpa, in_psi], content)
+    with pytest.raises(InputError, match=r"columns p1_kPa, p2_psi, expected .* of one unit"):
+        run(tmp_path, [mixed], content)
+
+
+def test_the_weight_of_runs_is_the_mean_of_their_directions(tmp_path):
+    """Two files of an arm along z at rest, the second one's frame tilted by 0.2 rad about y."""
+    files = []
+    for tilt in (0.0, 0.2):
+        values = np.zeros((30, 8))
+        values[:, 0] = np.arange(30.0)
+        values[:, 5], values[:, 7] = 50 * np.sin(tilt), 50 * np.cos(tilt)
+        header = ["t", "u", "x", "y", "z", "x1", "y1", "z1"]
+        files.append(written(tmp_path / f"a{tilt:g}.csv", text(values, header=header)))
+    content = ONE.replace("ROWS", "").replace('["x", "y", "w"]', '["x1", "y1", "z1"]')
+    content = content.replace("KEYS", '[frame]\nalign_z = "rest"\ngravity = [0, 0, 1]')
+    each = [part.recording.gravity for part in run(tmp_path, files, content, None)]
+    np.testing.assert_allclose(each[0], [0, 0, 1], atol=1e-9)
+    np.testing.assert_allclose(each[1], [-np.sin(0.2), 0, np.cos(0.2)], atol=1e-9)
+    (part,) = run(tmp_path, files, content)
+    np.testing.assert_allclose(part.recording.gravity, [-np.sin(0.1), 0, np.cos(0.1)], atol=1e-9)
+
+
+def test_runs_have_a_command_if_each_of_their_files_has_one(tmp_path):
+    values = np.arange(18.0).reshape(3, 6)
+    both = written(tmp_path / "a.csv", text(values, header=["t", "u", "x", "y", "w", "c1_kPa"]))
+    lacking = written(tmp_path / "b.csv", text(values, header=["t", "u", "x", "y", "w", "z"]))
+    content = ONE.replace("ROWS", "").replace('["x", "y", "z"], ', "")
+    content = content.replace("KEYS", "[commanded]")
+    (part,) = run(tmp_path, [both, both], content)
+    np.testing.assert_array_equal(part.recording.commanded[:, 0], [5, 11, 17, 5, 11, 17])
+    (part,) = run(tmp_path, [both, lacking], content)
+    assert part.recording.commanded is None
+    assert part.recording.samples == 6
+
+
 def test_number_of_files_must_fit(tmp_path):
     files = [*pair(tmp_path, 5, 5, "_a"), *pair(tmp_path, 5, 5, "_b"), *pair(tmp_path, 5, 5, "_c")]
     content = TWO.replace("OFFSET", "")

@@ -1,5 +1,6 @@
 """Motive exports with a known truth: centres by circle fit, frames, logs matched by time."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +68,20 @@ def test_ready_map_gives_the_true_centres(tmp_path, version, unit):
     expected = np.linalg.norm(truth[:, :, None] - truth[:, None], axis=3)
     np.testing.assert_allclose(distances, expected, atol=1e-5)
     assert any("radius 7.500 mm" in note for note in notes)
+
+
+def test_a_unit_in_the_map_counts_and_not_that_of_the_file(tmp_path):
+    """A take that calls its centimetres metres is a hundred times too large without it."""
+    files = [
+        take(tmp_path / "take.csv", unit="Meters"),
+        write_log(tmp_path / "log.csv", np.arange(0, 4.2, 0.05)),
+    ]
+    spec = load_map("motive")
+    stated, _ = imported(files)
+    known = replace(spec, key_points=replace(spec.key_points, unit="cm"))
+    (part,) = import_files(files, known, "x")
+    found = 100.0 * part.recording.key_points_mm
+    np.testing.assert_allclose(found, stated.key_points_mm, atol=1e-9)
 
 
 def test_bend_is_not_mirrored(tmp_path):

@@ -116,6 +116,61 @@ def test_other_chambers_move_the_memory(arms):
     assert np.linalg.norm(tips[1] - tips[0]) > 0.3
 
 
+def test_friction_holds_the_arm_back(arms):
+    """At 20 kPa the arm is bent less on its way up than on its way down from 54 kPa."""
+    for chamber in range(3):
+        path = np.zeros((4, 3))
+        path[:, chamber] = [0, 20, 54, 20]
+        for arm in arms[:2]:
+            tips = tips_along(arm, plain_loads(MOUNT), path)
+            away = np.linalg.norm(tips[:, :2] - tips[0, :2], axis=1)
+            assert away[1] < away[3] - 0.5
+            assert away[3] < away[2]
+    together = np.repeat([[0.0], [20.0], [54.0], [20.0]], 3, axis=1)
+    for arm in arms[:2]:
+        length = np.linalg.norm(tips_along(arm, plain_loads(MOUNT), together), axis=1)
+        assert length[0] < length[1] < length[3] - 0.05
+        assert length[3] < length[2]
+
+
+def test_the_section_is_a_ring_less_its_chambers(arms):
+    """Area and moment against sums over a grid; G = E / 3 of a material that keeps its volume."""
+    cell = 0.02
+    x = np.arange(-7.5 + cell / 2, 7.5, cell)
+    x, y = np.meshgrid(x, x)
+    for arm in arms[:2]:
+        wall = arm.rod.wall
+        radius = np.hypot(x, y)
+        solid = (radius > 1.5) & (radius < 7.5)
+        for (cx, cy), area in zip(wall.chambers, wall.areas, strict=True):
+            solid &= np.hypot(x - cx, y - cy) > np.sqrt(area / np.pi)
+        square = radius[solid] ** 2
+        assert wall.area == pytest.approx(solid.sum() * cell**2, rel=0.01)
+        assert wall.mean_second == pytest.approx(square.sum() * cell**2 / 2, rel=0.03)
+        assert wall.second[:2].mean() == pytest.approx(wall.mean_second)
+        assert wall.torsion == pytest.approx(2 / 3 * wall.modulus * wall.mean_second)
+        assert wall.fibre == pytest.approx(np.full(3, np.cos(np.radians(83.0)) ** 2), rel=0.7)
+
+
+def test_each_section_carries_the_cap_and_the_silicone_beyond_it(arms):
+    """2.5 g at the tip, and 60 mm of silicone of 1.07 g/cm^3, less and less towards the tip."""
+    for arm in arms:
+        rod, newton = arm.rod, 9.80665e-3
+        assert rod.tip_weight == pytest.approx(2.5 * newton, rel=0.12)
+        assert rod.beyond[-1] == pytest.approx(rod.tip_weight)
+        silicone = 1.07e-3 * rod.wall.area * 60.0 * newton
+        assert rod.beyond[0] == pytest.approx(rod.tip_weight + silicone)
+        assert (np.diff(rod.beyond) < 0).all()
+
+
+def test_key_planes_are_a_quarter_of_the_arm_apart(arms):
+    """Glued by hand to 0.4 mm, 17.5 mm apart on an arm of 70 mm."""
+    for arm in arms:
+        centres, _ = key_planes(arm, [0, 0, 0])
+        steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+        assert steps == pytest.approx(np.full(4, 17.5), abs=2.0)
+
+
 def test_robots_differ_by_seed_and_repeat(arms):
     tips = [key_planes(arm, [40, 10, 0])[0][-1] for arm in arms]
     for a in range(4):

@@ -166,6 +166,24 @@ def answer(port: int, kinds: tuple[str, ...]) -> list[str]:
     raise AssertionError(f"no {kinds} came")
 
 
+def test_the_emulated_controller_keeps_to_its_limits_and_holds_where_nothing_is_heard():
+    """-15 to 54 kPa; after 40 ms without a message the last set points are held, not vented."""
+    rig = VirtualRig(0)
+    rig.read()  # which compiles it
+    with emulated(rig, speed=20.0) as bench:
+        port = os.open(bench.port, os.O_RDWR | os.O_NOCTTY)
+        try:
+            os.write(port, line("WATCH 40 60000"))
+            assert answer(port, ("INFO",))[5:7] == ["40", "60000"]
+            os.write(port, line("SET 6 99 -99 3"))
+            until = time.monotonic() + 20.0
+            while bench.state != "H" and time.monotonic() < until:
+                answer(port, ("DATA",))
+            assert (bench.state, bench.target.tolist()) == ("H", [54.0, -15.0, 3.0])
+        finally:
+            os.close(port)
+
+
 def test_the_emulated_controller_refuses_what_makes_no_sense():
     rig = VirtualRig(0)
     rig.read()  # which compiles it

@@ -26,6 +26,16 @@ def test_options_reach_the_rig_with_their_types():
     assert (rig.config.gravity, rig.payload_g, rig.config.noise) == ((0.0, 0.0, 1.0), 2.0, 0.0)
 
 
+def test_every_option_of_the_simulated_rig_reaches_it():
+    """Hidden effects as text and as tuples, of which one begins after 60 s."""
+    text = "virtual:seed=2,noise_seed=7,roll_deg=30,rate_Hz=25,hidden=creep:0.5/payload:2@60"
+    config = open_rig(text).config
+    assert (config.seed, config.take, config.roll_deg, config.cameras.rate_Hz) == (2, 7, 30.0, 25.0)
+    assert (config.hidden, config.later) == ((("creep", 0.5),), (("payload", 2.0, 60.0),))
+    given = open_rig("virtual", hidden=(("creep", 0.5), ("payload", 2.0, 60.0))).config
+    assert (given.hidden, given.later) == (config.hidden, config.later)
+
+
 def test_an_object_of_a_users_module_is_opened_with_its_parameters():
     rig = open_rig(f"{OWN}:port=/dev/ttyUSB0,rate_hz=10")
     assert isinstance(rig, SafeRig), "nothing real is driven without it"
@@ -42,6 +52,8 @@ def test_a_module_of_the_working_folder_is_found(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [p for p in sys.path if p])
     assert open_rig("bench_of_mine:make:robot=4").config.seed == 4
+    with pytest.raises(InputError, match="'highest' is a safety limit of real rigs, and this one"):
+        open_rig("bench_of_mine:make:robot=4,highest=20")
 
 
 def test_a_rig_of_another_package(tmp_path, monkeypatch):
@@ -72,6 +84,10 @@ def test_a_rig_of_another_package(tmp_path, monkeypatch):
         (
             "virtual:gravity=0/1",
             "option 'gravity' is '0/1', expected 3 of numbers separated by '/'",
+        ),
+        (
+            "virtual:gravity=0/0/1/0",
+            "option 'gravity' is '0/0/1/0', expected 3 of numbers separated by '/'",
         ),
         ("virtual:seed=1,seed=2", "option 'seed' is given twice"),
         ("virtual:seed", "got 'seed', expected option=value after 'virtual:'"),

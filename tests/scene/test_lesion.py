@@ -16,13 +16,17 @@ from surgisoft.scene.lesion import (
     directed_site,
     good_sites,
     lesion_ring,
+    lesions_like,
     nearest_on_surface,
+    patch_normal,
     pointed_site,
 )
+from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.spec import LesionSpec
 from tests.scene.shapes import ball, box, lumpy, mesh_of
 
 FINE = ball(50.0, 5)
+BOX = box((80.0, 80.0, 80.0))
 whole = OrganSurface.whole
 
 
@@ -103,6 +107,107 @@ def test_pointing_finds_the_nearest_body():
     site = pointed_site([whole(near), whole(far)], np.array([100.0, 0.0, 35.0]), 15.0)
     assert site.body == 1
     np.testing.assert_allclose(site.point_mm, [100.0, 0.0, 30.0], atol=0.1)
+    assert site.moved_mm == pytest.approx(5.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("side", "most"), [(80.0, 20.0), (400.0, 40.0)])
+def test_a_point_is_near_within_20_mm_or_a_tenth_of_the_body(side, most):
+    body = [whole(box((side, side, side)))]
+    site = pointed_site(body, np.array([0.0, 0.0, 0.5 * side + most - 1.0]), 15.0)
+    assert site.moved_mm == pytest.approx(most - 1.0)
+    with pytest.raises(InputError, match=f"lies {most + 1:g} mm from .* at most {most:g} mm"):
+        pointed_site(body, np.array([0.0, 0.0, 0.5 * side + most + 1.0]), 15.0)
+
+
+def test_the_normal_of_a_patch_weighs_faces_by_their_area():
+    """A roof of two equal slopes, of which one is made of 2 faces and one of 8."""
+    corners = [[-10, -10, -2], [0, -10, 0], [0, 10, 0], [-10, 10, -2], [10, -10, -2], [10, 10, -2]]
+    roof = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3], [1, 4, 5], [1, 5, 2]], process=False)
+    finer = roof.subdivide(face_index=[2, 3])
+    mesh = Mesh(np.array(finer.vertices), np.array(finer.faces))
+    assert len(mesh.faces) == 10
+    found = patch_normal(mesh, np.zeros(3), 0, 30.0)
+    np.testing.assert_allclose(found, [0.0, 0.0, 1.0], atol=1e-12)
+
+
+def test_the_far_side_of_a_thin_plate_does_not_count_to_the_normal():
+    plate = trimesh.creation.box((80.0, 80.0, 2.0)).subdivide().subdivide().subdivide()
+    mesh = Mesh(np.array(plate.vertices), np.array(plate.faces))
+    centre = np.array([0.1, 0.2, -1.0])
+    found = patch_normal(mesh, centre, _face(mesh, centre), 20.0)
+    np.testing.assert_allclose(found, [0.0, 0.0, -1.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(("slope", "fits"), [(60.0, True), (75.0, True), (76.0, False)])
+def test_a_ring_lies_on_no_flank_steeper_than_75_5_degrees(slope, fits):
+    """The plane z = 0 falls off from x = 5 mm on; a ring of 20 mm reaches 5 mm over the edge."""
+    down = -30.0 * np.tan(np.radians(slope))
+    corners = [
+        [-40, -40, 0],
+        [5, -40, 0],
+        [5, 40, 0],
+        [-40, 40, 0],
+        [35, -40, down],
+        [35, 40, down],
+    ]
+    mesh = Mesh(np.array(corners), np.array([[0, 1, 2], [0, 2, 3], [1, 4, 5], [1, 5, 2]]))
+    ring = circle_on(mesh, np.zeros(3), 0, 20.0)
+    assert (ring is not None) is fits
+
+
+def test_a_face_that_closes_a_hole_wider_than_a_tenth_of_the_ring_is_no_tissue():
+    surface = OrganSurface(BOX, np.where(np.arange(len(BOX.faces)) == 1, 2.1, 2.0))
+    assert surface.is_lid(np.array([0, 1, 2]), 20.0).tolist() == [False, True, False]
+    assert not surface.is_lid(np.array([1]), 22.0).any()
+
+
+def test_good_sites_are_on_top_apart_and_off_what_closes_an_opening():
+    """On a cube the upper side is best; where half of it closes an opening, the other half."""
+    cube = BOX
+    for _ in range(4):
+        cube = mesh_of(trimesh.Trimesh(cube.vertices_mm, cube.faces, process=False).subdivide())
+    sites = good_sites([whole(cube)], 16.0)
+    assert len(sites) > 2
+    assert all(site.ring.normal[2] == pytest.approx(1.0) for site in sites[:3])
+    points = np.array([site.point_mm for site in sites])
+    apart = np.linalg.norm(points[:, None] - points, axis=2) + 1e9 * np.eye(len(points))
+    assert apart.min() >= 24.0
+    middles = cube.triangles_mm.mean(axis=1)
+    closing = (middles[:, 2] > 39.9) & (middles[:, 0] > 0.0)
+    sites = good_sites([OrganSurface(cube, np.where(closing, 40.0, 0.0))], 16.0)
+    assert sites[0].ring.normal[2] == pytest.approx(1.0)
+    assert not any(closing[site.ring.faces].any() for site in sites)
+    assert all(site.point_mm[0] < 0.0 for site in sites if site.ring.normal[2] > 0.5)
+
+
+def test_no_good_site_is_on_what_closes_a_hole_inside_its_ring():
+    """The best place of a cube, when a hole of 4 mm is closed there that the ring goes around."""
+    cube = BOX
+    for _ in range(4):
+        cube = mesh_of(trimesh.Trimesh(cube.vertices_mm, cube.faces, process=False).subdivide())
+    best = good_sites([whole(cube)], 16.0)[0]
+    middles = cube.triangles_mm.mean(axis=1)
+    closing = np.linalg.norm(middles - best.point_mm, axis=1) < 4.0
+    assert closing.any()
+    assert not closing[best.ring.faces].any()
+    sites = good_sites([OrganSurface(cube, np.where(closing, 4.0, 0.0))], 16.0)
+    _, faces = nearest_on_surface(cube, np.array([site.point_mm for site in sites]))
+    assert not closing[faces].any()
+
+
+def test_varied_lesions_are_uniform_in_place_and_diameter():
+    """In a disc of 5 mm the mean square of the distance is 12.5 mm^2; diameters are 18 to 22 mm."""
+    lesion = LesionSpec("box", (0.0, 0.0, 40.0), 20.0)
+    found = lesions_like(BOX, lesion, 80, 5.0, 0.1)
+    aside = np.array([each.centre_mm for each in found]) - lesion.centre_mm
+    assert np.abs(aside[:, 2]).max() < 1e-9
+    square = np.square(aside).sum(axis=1)
+    assert square.max() <= 25.0
+    assert square.mean() == pytest.approx(12.5, abs=2.5)
+    diameters = np.array([each.diameter_mm for each in found])
+    assert 18.0 <= diameters.min() < 18.5
+    assert 21.5 < diameters.max() <= 22.0
+    assert diameters.mean() == pytest.approx(20.0, abs=0.4)
 
 
 @given(seed=st.integers(0, 1000))

@@ -54,6 +54,31 @@ def near_silhouette(checker, origins, aims, truth):
     return unsure
 
 
+@pytest.mark.parametrize(
+    ("x", "degrees", "hit", "certain"),
+    [
+        (10.0, 90.0, True, True),
+        (10.0, 3.0, True, True),
+        (10.0, 2.8, True, False),
+        (39.98, 90.0, True, True),
+        (39.995, 90.0, True, False),
+        (40.0005, 90.0, False, False),
+        (40.005, 90.0, False, True),
+    ],
+)
+def test_a_hit_is_certain_off_the_edges_and_at_no_grazing_angle(x, degrees, hit, certain):
+    """On the upper side of a cube of 80 mm, at an angle to it; the limits are cos 87 degrees,
+    0.01 mm inside an edge and 0.001 mm outside of it."""
+    cube = BatchedScene([Body("cube", "organ", box((80.0, 80.0, 80.0)))], {}, most_nodes=50_000)
+    angle, place = np.radians(degrees), np.array([x, 3.0, 40.0])
+    aim = np.array([[0.0, np.cos(angle), -np.sin(angle)]])
+    struck, end, sure = cube.sure_hits(place - 20.0 * aim, aim, 60.0, {})
+    assert bool(sure[0]) is certain
+    assert (struck[0] != 0) == hit
+    if hit:
+        np.testing.assert_allclose(end[0], place, atol=1e-9)
+
+
 def test_ten_thousand_rays_agree_with_fcl(scene):
     bodies, engine = scene
     origins, aims = random_rays(10_000, seed=1)

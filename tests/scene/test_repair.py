@@ -73,6 +73,23 @@ def test_small_holes_are_closed():
     assert repaired.bodies[0].is_watertight
     assert repaired.bodies[0].volume_mm3 == pytest.approx(BALL.volume_mm3)
     assert counts(repaired) == {"holes closed": 3}
+    closed = repaired.holes_mm[0] > 0.0
+    removed = BALL.triangles_mm[[3, 100, 500]]
+    order = np.lexsort(removed.mean(axis=1).T)
+    added = repaired.bodies[0].triangles_mm[closed]
+    where = np.lexsort(added.mean(axis=1).T)
+    np.testing.assert_allclose(added.mean(axis=1)[where], removed.mean(axis=1)[order], atol=1e-9)
+    widths = np.ptp(removed, axis=1).max(axis=1)
+    np.testing.assert_allclose(repaired.holes_mm[0][closed][where], widths[order])
+
+
+def test_a_closed_hole_is_known_of_the_body_that_had_it():
+    """Of two balls the smaller one, which comes second, lacks a face."""
+    small = ball(30.0, 2)
+    apart = type(small)(small.vertices_mm + np.array([120.0, 0.0, 0.0]), small.faces[1:])
+    repaired = repair(*joined(BALL, apart), "two")
+    assert [int((holes > 0.0).sum()) for holes in repaired.holes_mm] == [0, 1]
+    assert repaired.holes_mm[1].max() == pytest.approx(np.ptp(small.triangles_mm[0], axis=0).max())
 
 
 def test_a_wider_hole_is_closed_by_its_flat_lid():
@@ -85,6 +102,19 @@ def test_a_wider_hole_is_closed_by_its_flat_lid():
     lost = BALL.volume_mm3 - repaired.bodies[0].volume_mm3
     assert counts(repaired)["holes closed"] == 1
     assert lost == pytest.approx(cap, rel=0.35)  # the rim is a zigzag of 6 mm edges
+    width = np.ptp(BALL.vertices_mm[np.unique(BALL.faces[~low])], axis=0).max()
+    lid = np.isclose(repaired.bodies[0].triangles_mm[:, :, 2].max(axis=1), rim, atol=1.5)
+    assert set(np.unique(repaired.holes_mm[0]).round(6)) == {0.0, round(float(width), 6)}
+    assert lid[repaired.holes_mm[0] > 0.0].all()
+
+
+def test_a_hole_of_more_than_three_tenths_of_the_body_is_refused():
+    """A cap down to 47 mm above the middle is 34 mm wide or more, of a ball of 100 mm."""
+    low = BALL.triangles_mm[:, :, 2].max(axis=1) < 47.0
+    width = np.ptp(BALL.vertices_mm[np.unique(BALL.faces[~low])], axis=0).max()
+    assert 33.0 < width < 50.0
+    with pytest.raises(InputError, match=r"is too large to close \(up to 30 %\)"):
+        repair(BALL.vertices_mm, BALL.faces[low], "ball")
 
 
 def test_inner_bodies_go_and_separate_ones_stay():
@@ -93,6 +123,7 @@ def test_inner_bodies_go_and_separate_ones_stay():
     cavity = type(inner)(inner.vertices_mm, inner.faces[:, ::-1])
     repaired = repair(*joined(BALL, cavity, apart), "three")
     assert counts(repaired)["inner bodies removed"] == 1
+    assert counts(repair(*joined(inner, BALL), "two")) == {"inner bodies removed": 1}
     volumes = [body.volume_mm3 for body in repaired.bodies]
     assert volumes == pytest.approx([BALL.volume_mm3, apart.volume_mm3])
 
@@ -111,6 +142,23 @@ def test_loose_specks_go():
     repaired = repair(*joined(BALL, speck), "ball")
     assert len(repaired.bodies) == 1
     assert counts(repaired) == {"small loose pieces removed": 1}
+
+
+def test_an_open_piece_of_less_than_a_tenth_goes_and_a_closed_one_stays():
+    """Of 5 mm beside a ball of 100 mm: a piece of skin, and a ball."""
+    small = type(BALL)(BALL.vertices_mm * 0.05 + np.array([60.0, 0.0, 0.0]), BALL.faces)
+    open_one = type(BALL)(small.vertices_mm, np.delete(small.faces, slice(0, 20), axis=0))
+    assert len(repair(*joined(BALL, small), "two").bodies) == 2
+    repaired = repair(*joined(BALL, open_one), "two")
+    assert len(repaired.bodies) == 1
+    assert counts(repaired) == {"small loose pieces removed": 1}
+
+
+def test_bodies_that_overlap_are_one():
+    """Two balls of 50 mm whose middles are 60 mm apart, and a third one 200 mm away."""
+    others = [type(BALL)(BALL.vertices_mm + np.array([x, 0.0, 0.0]), BALL.faces) for x in (60, 260)]
+    repaired = repair(*joined(BALL, *others), "three")
+    assert [len(body.faces) for body in repaired.bodies] == [2 * len(BALL.faces), len(BALL.faces)]
 
 
 def moebius():

@@ -194,6 +194,36 @@ def test_a_replaced_part_is_new_and_all_others_are_shared():
     assert list(arm.effects) == ["creep", "payload"]
 
 
+def test_an_arm_that_begins_away_from_rest_has_stood_for_ten_seconds():
+    """Creep has followed for that time; a lag of the line has died away, however slow it is."""
+    arm = model(("line_lag", "creep"))
+    arm.effects["line_lag"].log_up.data.fill_(2.0)
+    arm.effects["line_lag"].log_down.data.fill_(2.0)
+    first = torch.tensor([[30.0, 25.0, 20.0]])
+    stood = arm.first_state(first).memory
+    assert torch.equal(stood["line_lag"], arm.effects["line_lag"].rest(first))
+    plain = arm.replace(effects={"creep": arm.effects["creep"]})
+    for seconds, same in ((10.0, True), (30.0, False)):
+        rested = plain.initial_state(1)
+        time = torch.tensor([seconds])
+        state, _ = plain.step(rested, first - rested.pressure, time, torch.tensor([20.0]))
+        assert torch.allclose(stood["creep"], state.memory["creep"], rtol=1e-4) is same
+
+
+def test_a_chamber_that_never_moved_in_the_data_stays_where_it_was(away):
+    """A model that knows the second chamber at 20 alone ignores what it is told of it."""
+    arm = model(("line_lag", "hysteresis", "creep"))
+    still = arm.replace(spec=replace(arm.spec, idle=(None, 20.0, None)))
+    plain = replace(away, stood=None)
+    pressure = plain.pressure.clone()
+    pressure[..., 1] += 15.0 * torch.rand(pressure.shape[:2], generator=torch.manual_seed(0))
+    moved = replace(plain, pressure=pressure)
+    assert torch.equal(still.predict(moved), still.predict(plain))
+    taps = still.chain.scan(moved, still.first_pressure(moved))
+    assert (taps.pressure[..., 1] == 20.0).all()
+    assert (arm.predict(moved) - arm.predict(plain)).abs().max() > 0.1
+
+
 def test_a_drift_of_the_actuation_begins_with_the_recording(away):
     """The time for which an arm is assumed to have been held before is no time of the recording."""
     plain = model(())

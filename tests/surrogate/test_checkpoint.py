@@ -1,11 +1,20 @@
-"""A model's folder: who may read it."""
+"""A model's folder: who may read it, and what comes back from it."""
 
+import json
 import os
 import stat
 
 import pytest
+import torch
 
-from surgisoft.surrogate.checkpoint import OWN_FILES, default_arm, save_model
+from surgisoft.errors import InputError
+from surgisoft.surrogate.checkpoint import OWN_FILES, default_arm, load_model, save_model
+from surgisoft.surrogate.interval import ErrorInterval
+from surgisoft.surrogate.model import Validation
+
+INTERVAL = ErrorInterval(
+    (0.5, 0.95), ((0.1, 0.2), (0.3, 0.5)), (2.0, 2.0), 80, 4, "held-out rows", 0.05
+)
 
 
 @pytest.mark.parametrize("mask", [0o022, 0o027, 0o077])
@@ -18,3 +27,30 @@ def test_the_umask_decides_who_may_read_a_model(tmp_path, mask):
     modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "arm").iterdir()}
     assert modes == dict.fromkeys(OWN_FILES, 0o666 & ~mask)
     assert stat.S_IMODE((tmp_path / "arm").stat().st_mode) == 0o777 & ~mask
+
+
+def test_all_that_a_model_knows_of_its_error_comes_back(tmp_path):
+    arm = default_arm()
+    arm.validation = Validation(0.4, (0.2, None, 0.3, 0.4, 0.5), 99, 0.02, INTERVAL, 0.7)
+    save_model(arm, tmp_path / "arm")
+    again = load_model(tmp_path / "arm")
+    assert again.validation == arm.validation
+    assert again.fitted_rows == arm.fitted_rows
+    residuals = [each.training_residuals.residual_mm for each in (again, arm)]
+    assert torch.equal(*(torch.as_tensor(each) for each in residuals))
+    assert not any(parameter.requires_grad for parameter in again.parameters())
+    assert not again.training
+    arm.validation = Validation()
+    save_model(arm, tmp_path / "new")
+    assert load_model(tmp_path / "new").validation == Validation()
+
+
+def test_a_shape_at_rest_of_other_key_points_is_refused(tmp_path):
+    arm = default_arm()
+    save_model(arm, tmp_path / "arm")
+    file = tmp_path / "arm" / "config.json"
+    config = json.loads(file.read_text())
+    config["arm"]["key_points"] = 4
+    file.write_text(json.dumps(config))
+    with pytest.raises(InputError, match=r"4 key points by config.json, 'rest_mm' has shape \[5"):
+        load_model(tmp_path / "arm")

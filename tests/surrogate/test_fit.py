@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 
 from surgisoft.errors import InputError
 from surgisoft.surrogate import ensemble
@@ -14,7 +15,7 @@ from surgisoft.surrogate.effects import hypothesis_of
 from surgisoft.surrogate.effects.twist import Twist
 from surgisoft.surrogate.fit import FitConfig, excitation, fit
 from surgisoft.surrogate.history import pack
-from surgisoft.surrogate.interval import calibrate, coverage_of
+from surgisoft.surrogate.interval import ErrorInterval, calibrate, coverage_of
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import HawEnsemble, HawNN, range_weights, weighted_mse
 from surgisoft.surrogate.training import (
@@ -418,6 +419,102 @@ def test_auto_tries_the_effects_that_ask_for_it(monkeypatch):
             if warning.startswith("no effect with memory added"):
                 found |= set(re.findall(r"(\w+) \d+\.\d{3}", warning))
         assert found - {"none"} == tried
+
+
+def prescribed(monkeypatch, aside):
+    """Training that makes every network a constant, so many mm aside along x by its label."""
+
+    def trained(model, data, label, *_):
+        model.network.scale.zero_()
+        offset = torch.tensor([aside.get(label, 1.0), 0.0, 0.0])
+        model.network.mean.copy_(offset.repeat(SPEC.key_points))
+        return 1
+
+    monkeypatch.setattr("surgisoft.surrogate.fit.train_model", trained)
+
+
+def at(aside):
+    """One run of an arm whose key points are so many mm (T,) aside along x."""
+    t = torch.arange(len(aside)) * 0.1
+    points = torch.zeros(len(aside), SPEC.key_points, 3)
+    points[..., 0] = torch.as_tensor(aside, dtype=torch.float32)[:, None]
+    command = torch.tensor(walk(len(aside), np.random.default_rng(0)))
+    return pack([t], [command], [points])
+
+
+@pytest.mark.parametrize(
+    ("blocks", "t", "kept"), [(8, 2.2, False), (8, 2.5, True), (4, 99.0, False), (5, 99.0, True)]
+)
+def test_a_stage_is_kept_by_a_t_test_over_blocks_of_time(monkeypatch, blocks, t, kept):
+    """Of blocks of 25 rows whose squared error falls by 1 mm^2 on average, with this t of Student.
+
+    The critical value of eight blocks is 2.36; four are too few whatever they say.
+    """
+    spread = np.linspace(-1.0, 1.0, blocks)
+    gain = 1.0 + spread / spread.std(ddof=1) * np.sqrt(blocks) / t
+    assert stats.ttest_1samp(gain, 0.0).statistic == pytest.approx(t)
+    prescribed(monkeypatch, {"direction": 0.0})
+    # The squared distance to 1 less that to 0 is 1 - 2 x.
+    valid = at(np.repeat((1.0 - gain) / 2.0, 25))
+    config = FitConfig(hidden=(4,), prior="none", check_excitation=False)
+    stage = fit(at(np.zeros(100)), valid, SPEC, config).stages[-1]
+    assert (stage.name, stage.kept) == ("direction", kept)
+
+
+def test_the_radii_of_an_ensemble_are_those_of_its_mean(monkeypatch):
+    """Members 1 and 3 mm aside: their mean is 2 mm off, a single one sqrt(5) mm, RMS."""
+    prescribed(monkeypatch, {})
+    apart = ErrorInterval((0.95,), ((2.0,) * 3,), (0.0,) * 3, 250, 10, "cross-validation")
+
+    def trained(model, *_):
+        made = HawEnsemble.of([model.network, model.network])
+        for values in (*made.weights, *made.biases):
+            values.data.zero_()
+        made.scale.fill_(1.0)
+        made.mean.zero_()
+        for member, aside in enumerate((1.0, 3.0)):
+            made.biases[-1].data[member, 0] = torch.tensor([aside, 0.0, 0.0] * SPEC.key_points)
+        return model.replace(network=made), apart
+
+    monkeypatch.setattr("surgisoft.surrogate.fit.train_ensemble", trained)
+    config = FitConfig(hidden=(4,), prior="none", inputs="pressure", members=2)
+    result = fit(at(np.zeros(100)), at(np.zeros(250)), SPEC, config)
+    assert result.stages[-1].valid_rmse_mm == pytest.approx(2.0)
+    (radii,) = result.model.validation.interval.quantiles_mm
+    assert radii == pytest.approx([2.0 * np.sqrt(4.0 / 5.0)] * 3)
+
+
+def test_a_fit_keeps_residuals_of_both_recordings_and_notes_what_hardly_moved(monkeypatch):
+    """The validation recording is 2 mm aside; chamber 2 moves by a tenth of its range."""
+    prescribed(monkeypatch, {"pressure": 0.0})
+    train, valid = at(np.zeros(100)), at(np.full(100, 2.0))
+    share = torch.linspace(0.0, 1.0, 100)[:, None] * torch.tensor([0.2, 0.1, 1.0])
+    low, span = torch.tensor(SPEC.low), torch.tensor(SPEC.span)
+    train.pressure[0] = low + share * span
+    config = FitConfig(hidden=(4,), prior="none", inputs="pressure", check_excitation=False)
+    result = fit(train, valid, SPEC, config)
+    assert set(np.unique(np.asarray(result.known.residual_mm)[..., 0]).round(4)) == {0.0, 2.0}
+    (note,) = [each for each in result.warnings if "hardly moved" in each]
+    assert note.startswith(f"chamber 2 hardly moved ({0.1 * float(span[1]):.3g} kPa in all)")
+
+
+@pytest.mark.parametrize(
+    ("aside", "added"),
+    [
+        ({"creep": 0.96, "line_lag": 0.97}, []),
+        ({"creep": 0.94, "line_lag": 0.97}, ["creep"]),
+        ({"creep": 0.8, "line_lag": 0.7, "hysteresis": 0.6, "rate_dependence": 0.9},
+         ["hysteresis", "line_lag"]),
+    ],
+)  # fmt: skip
+def test_auto_adds_two_effects_at_most_of_a_tenth_of_the_squared_error(monkeypatch, aside, added):
+    prescribed(monkeypatch, aside)
+    config = FitConfig(
+        hidden=(4,), prior="none", inputs="pressure", effects=("auto",), check_excitation=False
+    )
+    result = fit(at(np.zeros(100)), at(np.zeros(250)), SPEC, config)
+    assert [stage.name for stage in result.stages[1:]] == added
+    assert sorted(result.model.effects) == sorted(added)
 
 
 @pytest.mark.parametrize(

@@ -311,8 +311,12 @@ def setup_faults(
     """Benchmark of the set-up tests: wrong frames, units, orders, chambers and clocks."""
     from benchmarks.setup_faults import markdown, run
 
+    from surgisoft.errors import InputError
+
     numbers = _numbers("--robots", robots) if robots else []
     some = [(folder, models) for folder in cases or []]
+    if not (numbers or folders or some):
+        raise InputError("--robots '': expected seeds such as 142,143, or --source or --cases")
     with _kept("setup-faults", work) as report:
         outcomes = run(numbers, folders or [], some, count, seed, work, processes, report)
     command = f"surgisoft benchmark setup-faults --robots '{robots}' --count {count} --seed {seed}"

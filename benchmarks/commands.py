@@ -310,7 +310,6 @@ def setup_faults(
 ) -> None:
     """Benchmark of the set-up tests: wrong frames, units, orders, chambers and clocks."""
     from benchmarks.setup_faults import markdown, run
-
     from surgisoft.errors import InputError
 
     numbers = _numbers("--robots", robots) if robots else []

@@ -176,7 +176,7 @@ def _dead_chamber(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def _dead_point(recording: Recording, rng: np.random.Generator) -> Recording:
-    """One key point that moves keeps one position: with another fault the tip may be the first."""
+    """One key point keeps one position: one that moves, whatever the order of the key points."""
     points = recording.key_points_mm.copy()
     motion = np.sqrt(np.nanvar(points, axis=0).sum(1))
     k = rng.choice(np.flatnonzero(motion >= LEAST_MOTION * motion.max()))
@@ -369,7 +369,9 @@ def of_cases(folder: Path, models: Path) -> list[Source]:
         clean, hidden = robots.setdefault(truth["robot"], ([], []))
         (hidden if truth["truth"] else clean).extend(sorted(file.parent.glob("after/*.parquet")))
     if not any(clean for clean, _ in robots.values()):
-        raise InputError(f"{folder}: expected cases of which one at least has an empty truth")
+        raise InputError(
+            f"{folder}: expected a folder of cases, with one at least in which nothing is missing"
+        )
     return [
         Source(folder.name, model_folder(folder, robot, models), tuple(clean), tuple(hidden))
         for robot, (clean, hidden) in sorted(robots.items())

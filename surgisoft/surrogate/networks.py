@@ -20,7 +20,7 @@ HIDDEN = (128, 128, 128, 128)
 """Best of the paper's six architectures: 4 hidden layers of 128 neurons."""
 MOST_STRETCH = math.log(10.0)
 """Largest logarithm of an arc's length over its length at rest, and of its inverse. No arm gets so
-long; actuation in another unit than the model's would make lengths that are no numbers."""
+long; actuation in another unit than the model's would make lengths that are not finite."""
 
 
 def parse_widths(text: str) -> tuple[int, ...]:

@@ -13,6 +13,8 @@ MINOR = 0.25
 gives every chamber and axis some value."""
 KNOWN_MINOR = 0.05
 """The same of readings with intervals, which tell what is there."""
+MOST_TOLD = 6
+"""Largest number of readings with a size in a sentence: six chambers have 30 couplings."""
 WIDEST = 10.0
 """Ratio of the ends of a positive reading's interval from which its value is not known."""
 MOST_PERCENT = 110.0
@@ -73,6 +75,8 @@ def in_words(
 ) -> str:
     """Readings as one sentence; empty where recordings determine none of them.
 
+    Of more than `MOST_TOLD` readings with a size the largest are told, and how many are not.
+
     intervals: 95 % interval of each reading; None: the values are first estimates.
     """
     ends = [None] * len(readings) if intervals is None else intervals
@@ -80,11 +84,18 @@ def in_words(
     least = MINOR * max(sizes, default=0.0)
     if intervals is not None and any(low != high for low, high in intervals):
         least *= KNOWN_MINOR / MINOR
-    return ", ".join(
-        each.said(limits)
+    known = [
+        (each, limits)
         for each, limits in zip(readings, ends, strict=True)
         if each.known(limits) and (each.size is None or abs(each.size) >= least)
-    )
+    ]
+    sized = [each for each in known if each[0].size is not None]
+    if len(sized) <= MOST_TOLD:
+        return ", ".join(each.said(limits) for each, limits in known)
+    sized.sort(key=lambda each: -abs(each[0].size or 0.0))
+    told = [each for each in known if each[0].size is None] + sized[:MOST_TOLD]
+    text = ", ".join(each.said(limits) for each, limits in told)
+    return f"{text}, and {len(sized) - MOST_TOLD} smaller ones"
 
 
 def each_chamber(

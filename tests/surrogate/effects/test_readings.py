@@ -72,6 +72,20 @@ def test_a_coupling_says_which_chamber_loses_to_which(config):
         assert value == pytest.approx(100 * float(lost.detach()), abs=1e-3)
 
 
+def test_of_many_couplings_the_six_largest_are_told():
+    """Six chambers have 30 of them: the largest first, and how many more there are."""
+    six = replace(FACTS, low=torch.zeros(6), high=torch.full((6,), 100.0), rest=torch.zeros(6))
+    effect = make_effect("coupling", six, pairs=True)
+    shares = [0.01 * (20 + k) for k in range(30)]
+    words = in_words(with_amplitudes(effect, linear=0.0, quadratic=shares).readings())
+    said = words.split(", ")
+    assert said[0] == "chamber 6 loses 49 % of its push to chamber 5"
+    assert said[5] == "chamber 5 loses 44 % of its push to chamber 6"
+    assert said[6:] == ["and 24 smaller ones"]
+    few = [*shares[:6], *[0.0] * 24]
+    assert in_words(with_amplitudes(effect, quadratic=few).readings()).count("chamber") == 12
+
+
 def test_a_dead_zone_says_the_push_that_is_lost_far_from_rest():
     effect = with_amplitudes(
         make_effect("dead_zone", FACTS, width=0.001, each=True), threshold=[0.1, 0.0, 0.04]

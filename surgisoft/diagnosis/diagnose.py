@@ -386,7 +386,9 @@ def diagnose(
     begin = time.perf_counter()
     report = progress or (lambda text: None)
     model, recordings, before = open_model(model, recordings, before, predictions, error_mm)
-    model, recordings, notes = open_inputs(model, recordings, sized=not setup_tests)
+    model, recordings, notes = open_inputs(
+        model, recordings, sized=not setup_tests, compared=before is not None
+    )
     whole, recordings = recordings, Sealed(recordings).training
     if setup_tests:
         report("set-up")

@@ -277,7 +277,7 @@ def improve(
     if before is None and not isinstance(reference, TrainingResiduals | None):
         before, reference = reference, None
     model, recordings, before = open_model(model, recordings, before, None, error_mm)
-    model, recordings, notes = open_inputs(model, recordings)
+    model, recordings, notes = open_inputs(model, recordings, compared=before is not None)
     known, sealed = model.training_residuals, Sealed(recordings)
     recordings = sealed.training
     table = residual_table(model, recordings)

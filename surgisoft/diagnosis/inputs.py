@@ -9,7 +9,12 @@ from surgisoft.diagnosis.other_models import notes_of
 from surgisoft.diagnosis.residuals import Problem, Sealed, held_out_rows, residual_table
 from surgisoft.diagnosis.weight import under_weight
 from surgisoft.errors import InputError
-from surgisoft.measurement.histories import check_fits, history_of, outside_range
+from surgisoft.measurement.histories import (
+    check_fits,
+    faster_than_fit,
+    history_of,
+    outside_range,
+)
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.fitted_rows import Seen
@@ -23,13 +28,18 @@ Recordings = Iterable[Recording | str | Path] | Recording | str | Path
 
 
 def open_inputs(
-    model: ArmModel | str | Path, recordings: Recordings, sized: bool = True
+    model: ArmModel | str | Path,
+    recordings: Recordings,
+    sized: bool = True,
+    compared: bool = False,
 ) -> tuple[ArmModel, list[Recording], tuple[str, ...]]:
     """The model and the recordings as a diagnosis takes them, with notes for its reader.
 
     A model whose recordings were made with another direction of gravity is given loads of any
-    direction (`under_weight`); the notes say so, and say where the recordings leave the range of
-    actuation that the model was fitted to. sized: whether the size of the arm has to fit, too.
+    direction (`under_weight`); the notes say so, and say where the recordings leave the range or
+    the speed of the actuation that the model was fitted to. sized: whether the size of the arm has
+    to fit, too; compared: whether they are compared with recordings from before a change, so that
+    what the model lacked before does not count.
     """
     arm = load_model(model)
     measured = load_recordings(recordings)
@@ -37,6 +47,8 @@ def open_inputs(
     turned, notes = under_weight(arm, measured)
     taken_part = part_in_fit(arm, measured)
     beyond = outside_range(arm.spec, measured)
+    if not compared:
+        beyond += faster_than_fit(arm.spec, measured)
     return turned, measured, (*notes_of(arm), *notes, *beyond, *taken_part)
 
 

@@ -25,6 +25,12 @@ SIZES = 20.0
 """Factor by which the key points' extent and the arm's length differ when a unit is wrong."""
 OUTSIDE_SHARE = 0.03
 """How far beyond the fitted range, as a share of it, an actuation may go without a note."""
+SPEED_S = 0.25
+"""Time over which the speed of the actuation is taken, s: noise of the pressure counts little."""
+SPEED_QUANTILE = 0.95
+"""Share of the rows in which the actuation moves more slowly than its speed."""
+FASTER = 1.5
+"""How many times as fast as in the training data an actuation may move without a note."""
 IDLE_SHARE = 0.02
 """A chamber that moved no more than this share of the widest range is ignored as not moved."""
 
@@ -123,7 +129,52 @@ def arm_spec(recordings: list[Recording], actuation: str = "measured") -> ArmSpe
         diameter_mm=first.arm.diameter_mm,
         gravity=None if first.gravity is None else tuple(first.gravity.tolist()),
         temperature_C=_mean_temperature(recordings),
+        speed_per_s=speed_of(recordings, span, actuation),
     )
+
+
+def speed_of(
+    recordings: list[Recording], span: np.ndarray | tuple[float, ...], actuation: str = "measured"
+) -> float:
+    """How fast the actuation moves, as a share of its range in a second, 1/s.
+
+    It is the `SPEED_QUANTILE` over all rows of the change within `SPEED_S`, of the chamber that
+    moves most; span: (m,) range of each chamber, in the recordings' unit. 0 where recordings have
+    steady states alone.
+    """
+    found = [np.zeros(1)]
+    for recording in recordings:
+        if recording.kind == "settled":
+            continue
+        signal = actuation_of(recording, actuation) / np.asarray(span)
+        for run in recording.runs:
+            t_s, x = recording.t_s[run], signal[run]
+            later = np.searchsorted(t_s, t_s + SPEED_S)
+            rows = np.flatnonzero(later < len(t_s))
+            later = later[rows]
+            moved = np.abs(x[later] - x[rows]).max(axis=1) / (t_s[later] - t_s[rows])
+            found.append(moved)
+    return float(np.quantile(np.concatenate(found), SPEED_QUANTILE))
+
+
+def faster_than_fit(spec: ArmSpec, recordings: list[Recording]) -> list[str]:
+    """A note where recordings move the arm faster than the training data of its model did."""
+    if spec.speed_per_s is None:
+        return []
+    came = speed_of(recordings, spec.span, spec.actuation)
+    if came <= FASTER * spec.speed_per_s:
+        return []
+    slow = (
+        f"{came / spec.speed_per_s:.2g} times as fast as in the recordings of the fit"
+        if spec.speed_per_s
+        else "and the recordings of the fit have steady states alone"
+    )
+    percent = float(f"{100 * came:.2g}")
+    return [
+        f"the actuation moves by {percent:g} % of its range in a second, {slow}: effects of speed "
+        "may have been missing ever since; fit the model to motion as fast as this, too, or give "
+        "'surgisoft diagnose' the recordings of the fit by --before, to find what has changed"
+    ]
 
 
 def _mean_temperature(recordings: list[Recording]) -> float | None:

@@ -37,6 +37,9 @@ class ArmSpec:
     """Unit vector along the weight, base frame; None where the recordings do not state it."""
     temperature_C: float | None = None
     """Mean temperature of the room where the recordings were made, degrees Celsius, if known."""
+    speed_per_s: float | None = None
+    """How fast the actuation moved in the training data, as a share of its range in a second
+    (`measurement.histories.speed_of`), 1/s; 0 if it had steady states alone; None if unknown."""
 
     def __post_init__(self):
         for name in ("low", "high", "band", "idle"):

@@ -3,9 +3,16 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
-from surgisoft.measurement.histories import actuation_noise, history_of
+from surgisoft.measurement.histories import (
+    actuation_noise,
+    arm_spec,
+    faster_than_fit,
+    history_of,
+    speed_of,
+)
 from surgisoft.measurement.recordings import Recording
 
 
@@ -59,3 +66,48 @@ def test_a_step_from_run_to_run_is_no_noise():
     made = Recording("pairs", np.arange(62.0), measured, np.zeros((62, 1, 3)), run=run)
     expected = 1.4826 * 0.2 / np.sqrt(2)
     np.testing.assert_allclose(actuation_noise(made), [expected], rtol=1e-6)
+
+
+def triangles(period_s, seconds=40.0, chambers=2, kind="continuous"):
+    """Chamber 1 rises from 0 to 50 kPa and falls in each period, chamber 2 in three of them."""
+    t_s = np.arange(0.0, seconds, 0.04)
+    wave = [1 - np.abs((t_s / period % 1) * 2 - 1) for period in (period_s, 3 * period_s)]
+    return Recording(
+        f"triangles of {period_s:g} s",
+        t_s,
+        50.0 * np.stack(wave, 1),
+        np.zeros((len(t_s), 2, 3)),
+        kind=kind,
+    )
+
+
+def test_the_speed_is_that_of_the_fastest_chamber_in_its_range():
+    """A triangle goes through its whole range twice in a period."""
+    assert arm_spec([triangles(8.0)]).speed_per_s == pytest.approx(2 / 8.0, rel=0.03)
+    assert speed_of([triangles(8.0)], (50.0, 50.0)) == pytest.approx(2 / 8.0, rel=1e-3)
+    assert speed_of([triangles(8.0)], (100.0, 50.0)) == pytest.approx(1 / 8.0, rel=1e-3)
+    # One row in twenty may be faster.
+    some = [triangles(8.0, 400.0), triangles(2.0, 10.0)]
+    assert speed_of(some, (50.0, 50.0)) == pytest.approx(2 / 8.0, rel=1e-3)
+    assert speed_of([triangles(8.0), triangles(2.0)], (50.0, 50.0)) == pytest.approx(1.0, rel=1e-3)
+
+
+def test_no_speed_leads_from_run_to_run_and_steady_states_have_none():
+    slow = triangles(8.0)
+    lift = np.where(slow.t_s[:, None] < 20.0, 0.0, 50.0)
+    broken = replace(slow, measured=slow.measured + lift, run=(slow.t_s >= 20.0).astype(int))
+    assert speed_of([broken], (50.0, 50.0)) == pytest.approx(2 / 8.0, rel=1e-3)
+    assert speed_of([replace(slow, kind="settled")], (50.0, 50.0)) == 0.0
+
+
+def test_motion_that_is_faster_than_that_of_the_fit_is_noted():
+    spec = arm_spec([triangles(8.0)])
+    assert faster_than_fit(spec, [triangles(6.0)]) == []
+    (note,) = faster_than_fit(spec, [triangles(2.0)])
+    assert "100 % of its range in a second, 4 times as fast as in the recordings of the fit" in note
+    assert faster_than_fit(replace(spec, speed_per_s=None), [triangles(2.0)]) == []
+    settled = arm_spec([triangles(8.0, kind="settled")])
+    assert settled.speed_per_s == 0.0
+    (note,) = faster_than_fit(settled, [triangles(8.0)])
+    assert "and the recordings of the fit have steady states alone" in note
+    assert faster_than_fit(settled, [triangles(8.0, kind="settled")]) == []

@@ -707,7 +707,7 @@ def next_experiment(
             model = arm_by_itself(given_callable(model))
         return propose(load_model(model), between, minutes, settings, progress)
     arm, measured, earlier = open_model(model, given, before, predictions, error_mm)
-    arm, measured, notes = open_inputs(arm, measured)
+    arm, measured, notes = open_inputs(arm, measured, compared=earlier is not None)
     both = None
     if earlier is None:
         problem = identification_problem(arm, measured, reference)

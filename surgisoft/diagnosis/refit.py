@@ -33,7 +33,7 @@ import torch
 from torch import Tensor
 
 from surgisoft.diagnosis.data_quality import FAR_ROWS, far_share
-from surgisoft.diagnosis.estimation.effects import fit_effects, shrink, starts
+from surgisoft.diagnosis.estimation.effects import fitted_model, shrink, starts
 from surgisoft.diagnosis.estimation.intervals import Parameter
 from surgisoft.diagnosis.estimation.nuisance import kinds
 from surgisoft.diagnosis.residuals import TOGETHER, Problem
@@ -867,10 +867,10 @@ def apart_mm(problem: Problem, effects: Iterable[str], config: RefitConfig = REF
     for part in range(config.seeds):
         out = split.part == part
         try:
-            fitted = fit_effects(problem.without_blocks(out), names)
+            fitted = fitted_model(problem.without_blocks(out), names)
         except InputError:
             return None
-        square += float(split.losses(fitted.model)[out].sum())
+        square += float(split.losses(fitted)[out].sum())
     return float(np.sqrt(square / _counts(split).sum()))
 
 

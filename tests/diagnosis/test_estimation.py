@@ -12,7 +12,7 @@ from scipy import stats
 
 from surgisoft.diagnosis.candidates import with_effect
 from surgisoft.diagnosis.estimation import network_error
-from surgisoft.diagnosis.estimation.effects import fit_effects
+from surgisoft.diagnosis.estimation.effects import fit_effects, fitted_model
 from surgisoft.diagnosis.estimation.intervals import (
     DRAWS,
     Estimates,
@@ -375,9 +375,9 @@ def test_effects_are_fitted_again_without_the_quarter_that_judges_the_layer(monk
 
     def recorded(inside, names):
         seen.append((inside.time_s, names))
-        return fit_effects(inside, names)
+        return fitted_model(inside, names)
 
-    monkeypatch.setattr("surgisoft.diagnosis.estimation.network.fit_effects", recorded)
+    monkeypatch.setattr("surgisoft.diagnosis.estimation.network.fitted_model", recorded)
     assert retune(fitted.model, problem, ["gain_mismatch"]).kept
     assert [names for _, names in seen] == [["gain_mismatch"]] * 4
     left = [np.setdiff1d(problem.time_s, time_s) for time_s, _ in seen]
@@ -385,6 +385,19 @@ def test_effects_are_fitted_again_without_the_quarter_that_judges_the_layer(monk
     shares = [len(each) / len(problem.time_s) for each in left]
     assert shares == pytest.approx([0.25] * 4, abs=0.06)
     assert all(a.max() < b.min() for a, b in itertools.pairwise(left))
+
+
+def test_the_model_alone_is_that_of_the_fit_with_intervals():
+    """Of effects with few and with many values, and of one that is new."""
+    problem = problem_of(
+        default_arm(), [measured_on(TRUTHS["gain_mismatch"], rows=100)], part="training"
+    )
+    names = ["hysteresis", "gain_mismatch"]
+    alone, whole = fitted_model(problem, names), fit_effects(problem, names).model
+    mine, theirs = alone.state_dict(), whole.state_dict()
+    assert mine.keys() == theirs.keys()
+    assert all(torch.equal(mine[name], theirs[name]) for name in mine)
+    assert not any(p.requires_grad for p in alone.parameters())
 
 
 def test_a_recurrent_baseline_takes_no_effects():

@@ -4,7 +4,6 @@ import copy
 import json
 from dataclasses import asdict, replace
 from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -374,9 +373,9 @@ def test_effects_apart_are_fitted_without_the_part_that_judges_them(problem, mon
 
     def fitted(posed, names):
         seen.append(set(posed.index.tolist()))
-        return SimpleNamespace(model=posed.model)
+        return posed.model
 
-    monkeypatch.setattr(refitting, "fit_effects", fitted)
+    monkeypatch.setattr(refitting, "fitted_model", fitted)
     unknown = replace(problem, model=problem.model.replace())
     unknown.model.fitted_rows = None
     found = apart_mm(unknown, ["line_lag"], SHORT)

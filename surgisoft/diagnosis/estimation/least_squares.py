@@ -230,10 +230,12 @@ def fit_all(
     keys: list[str],
     iterations: int = OPTIONS.iterations,
     held: str | None = None,
+    slopes_at_end: bool = True,
 ) -> Fit:
     """Fit the named effects of a model, in place, to a problem's rows; others stay as they are.
 
-    held: effect among them whose amplitudes stay as they are too.
+    held: effect among them whose amplitudes stay as they are too. slopes_at_end: whether the
+    fit's `jacobian` is needed; where it is not, it may be empty, (S, n, 3, 0).
     """
     parameters = free_parameters(model, keys, held)
     predict = Prediction(repeated_scan(model, problem, keys), parameters)
@@ -272,7 +274,9 @@ def fit_all(
         damping = max(damping / OPTIONS.damping_factor, OPTIONS.least_damping)
         if fall < OPTIONS.least_fall:
             break
-    slopes_now = predict.sensitivities(values, predicted)
+    slopes_now = np.empty((*residual.shape, 0))
+    if slopes_at_end:
+        slopes_now = predict.sensitivities(values, predicted)
     return Fit(values, slopes_now, residual, nuisance, hold, cost, prior)
 
 

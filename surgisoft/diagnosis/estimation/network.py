@@ -25,7 +25,7 @@ import torch
 from scipy.special import stdtr
 from torch import Tensor, nn
 
-from surgisoft.diagnosis.estimation.effects import fit_effects
+from surgisoft.diagnosis.estimation.effects import fitted_model
 from surgisoft.diagnosis.estimation.nuisance import held_out_parts
 from surgisoft.diagnosis.residuals import Problem
 from surgisoft.diagnosis.statistics import block_interval, block_sums
@@ -90,7 +90,7 @@ def _quarters(problem: Problem) -> Iterator[np.ndarray]:
 
 def _fitted_without(inside: Problem, effects: tuple[str, ...]) -> tuple[ArmModel, ArmModel]:
     """The models without and with a new layer that the rows of a problem lead to."""
-    alone = fit_effects(inside, list(effects)).model if effects else inside.model
+    alone = fitted_model(inside, list(effects)) if effects else inside.model
     return alone, best_layer(alone, inside.with_model(alone)).model
 
 

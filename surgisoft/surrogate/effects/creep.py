@@ -146,14 +146,16 @@ class Creep(Effect):
         held = seconds or TEN_MINUTES
         times, spectrum = self.times.double(), self.spectrum.detach().double()
 
-        def crept(after: float) -> float:
-            return float(-spectrum @ torch.expm1(-after / times))
+        rates = times.reciprocal()
 
-        low, high = 0.0, held
+        def crept(after: float) -> float:
+            return float(-spectrum @ torch.expm1(rates * -after))
+
+        low, high, whole = 0.0, held, crept(held)
         for _ in range(HALVINGS):
             middle = (low + high) / 2
-            low, high = (low, middle) if 2 * crept(middle) > crept(held) else (middle, high)
-        grown = 100 * float(self.amount.detach()) * crept(held)
+            low, high = (low, middle) if 2 * crept(middle) > whole else (middle, high)
+        grown = 100 * float(self.amount.detach()) * whole
         text = f"push under a full load held for {duration(held)} {{+}}"
         return [
             Reading(text, grown, "%", signed=True),

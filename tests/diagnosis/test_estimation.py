@@ -388,11 +388,10 @@ def test_effects_are_fitted_again_without_the_quarter_that_judges_the_layer(monk
 
 
 def test_the_model_alone_is_that_of_the_fit_with_intervals():
-    """Of effects with few and with many values, and of one that is new."""
-    problem = problem_of(
-        default_arm(), [measured_on(TRUTHS["gain_mismatch"], rows=100)], part="training"
-    )
-    names = ["hysteresis", "gain_mismatch"]
+    """Bit for bit, of two new effects."""
+    truth = measured_on(TRUTHS["gain_mismatch"], runs=2, rows=60)
+    problem = problem_of(bare_arm(), [truth], part="all")
+    names = ["gain_mismatch", "misalignment"]
     alone, whole = fitted_model(problem, names), fit_effects(problem, names).model
     mine, theirs = alone.state_dict(), whole.state_dict()
     assert mine.keys() == theirs.keys()

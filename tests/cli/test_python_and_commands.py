@@ -139,8 +139,9 @@ def test_improve_gives_one_result(lab):
     assert f"{least.effect} leaves least, {least.heldout_rmse_mm:.3f} mm" in text
     assert f">{least.effect}</td>" in text
     assert ("<td>added</td>" in text) == bool(improved.steps)
-    for name in ("story/bodies.png", "story.rrd"):
+    for name in ("story/bodies.png", "story/waterfall.png", "story.rrd"):
         assert (lab / name).stat().st_size > 10_000
+    assert (lab / "story" / "waterfall.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 
 
 def test_the_next_experiment_asks_what_diagnose_asks(lab):

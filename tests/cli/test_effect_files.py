@@ -10,6 +10,7 @@ from typer.main import get_command
 
 from surgisoft.cli import run, with_commands
 from surgisoft.errors import InputError
+from surgisoft.experiments import run as experiment_run
 from surgisoft.experiments.run import open_results, run_experiment
 from surgisoft.experiments.spec import load_experiment
 from surgisoft.measurement.protocols import make_protocol
@@ -103,15 +104,14 @@ NEXT = {"compare": 1, "amend": 1, "train": 1}
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory):
-    """A default arm with the documentation's effect, a recording, a scene and experiments."""
+    """A default arm with the documentation's effect alone, a recording, a scene and experiments."""
     folder = tmp_path_factory.mktemp("lab")
     (folder / "slack.py").write_text(EXAMPLE)
     register_effect_file(folder / "slack.py")
     arm = default_arm()
     effect = make_effect("slack", arm.facts)
     effect.loss.data.fill_(0.3)
-    effects = {**dict(arm.effects), "slack": effect}
-    with_slack = ArmModel(arm.spec, arm.network, effects, arm.rest_mm, arm.validation)
+    with_slack = ArmModel(arm.spec, arm.network, {"slack": effect}, arm.rest_mm, arm.validation)
     save_model(with_slack, folder / "arm")
     user_defined.FILES.clear()
     rig = VirtualRig(0, take=7)
@@ -167,7 +167,14 @@ def test_the_help_names_both_names_of_the_option(name, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_opens_the_model_only_with_its_file(name, capsys):
+def test_a_command_opens_the_model_only_with_its_file(name, capsys, monkeypatch):
+    asked, pool = [], experiment_run.workers
+
+    def one_worker(processes, *given):
+        asked.append(processes)
+        return pool(1, *given)
+
+    monkeypatch.setattr(experiment_run, "workers", one_worker)
     arguments = COMMANDS[name].split()
     assert run(arguments) == 2
     error = capsys.readouterr().err
@@ -183,12 +190,13 @@ def test_a_command_opens_the_model_only_with_its_file(name, capsys):
     ]
     assert len(following) == NEXT.get(name, len(following))
     assert all(line.endswith(" --effect-file slack.py") for line in following), following
+    assert asked == ([2] if name == "experiment run" else [])
     if name == "experiment run":
         same_rows_in_one_process()
 
 
 def same_rows_in_one_process():
-    """The two processes of `experiment run`, which need the file too, gave the rows of one."""
+    """The process of `experiment run`, which needs the file too, gave the rows of this one."""
     both = sorted(Path("results", "rows").iterdir())
     assert len(both) == 2, "two episodes, each one a block of work"
     rows = [json.loads(path.read_text()) for path in both]

@@ -45,8 +45,9 @@ def least_squares(
         best = torch.where(better[:, None], tried, best)
         if left == 0:
             break
-        error = torch.where(better[:, None], new_error, error)
-        jacobian = torch.where(better[:, None, None], _jacobian(place, value), jacobian)
+        if better.any():  # a slope costs more than all else here
+            error = torch.where(better[:, None], new_error, error)
+            jacobian = torch.where(better[:, None, None], _jacobian(place, value), jacobian)
         factor = torch.where(better[:, None, None], 0.1 * factor, 10.0 * factor).clamp(1e-6, 1e6)
     return best
 

@@ -528,13 +528,11 @@ class ModelArm:
         if self._compiled is None or torch.compiler.is_compiling() or torch.jit.is_tracing():
             return None
         graded = torch.is_grad_enabled()
-        if graded and self._compiled.learns:
-            return None
         for tensor in tensors:
             plain = type(tensor) is Tensor and tensor.dtype == torch.float32
             if not plain or (graded and tensor.requires_grad):
                 return None
-        return self._compiled
+        return None if graded and self._compiled.learns else self._compiled
 
     def _stepped(self, step: CompiledStep, part: ArmPart, action: Tensor, dt_s: float) -> ArmPart:
         """The part after a step with the action (B, m) kPa, all but what is measured."""

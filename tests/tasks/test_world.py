@@ -346,6 +346,22 @@ def test_an_arm_in_degrees_follows_a_path(tripod, tmp_path):
         ControllerGraph(task, {"arm": torch.nn.Identity()})
 
 
+def test_each_arm_adapts_by_its_own_model(tripod):
+    """What an arm learns does not depend on the model of the arm before it."""
+    config = WorldConfig(
+        randomisation=Randomisation(gain=0.1), observer=replace(AlphaBetaFilter(), adapts=True)
+    )
+    seen = []
+    for other in (tripod("kPa", 70.0), default_arm()):
+        arms = {"other": Mounted(other, torch.eye(4)), "arm": Mounted(default_arm(), torch.eye(4))}
+        world = World(arms, config)
+        state = world.start(streams(0, 2))
+        for action in actions_of(world, 2, 5):
+            state = world.step(state, action)
+        seen.append(state.arms["arm"].seen_mm)
+    torch.testing.assert_close(seen[0], seen[1], rtol=0.0, atol=1e-6)
+
+
 def test_a_scene_takes_arms_in_psi(tripod, tmp_path):
     """Rewards of random actions are those of the same arms in kPa."""
     rewards = []

@@ -33,10 +33,12 @@ def least_squares(
     place, value = _traced(residual, best)
     error, jacobian = value.detach(), _jacobian(place, value)
     eye = torch.eye(best.shape[1], dtype=best.dtype, device=best.device)
+    helped: bool | Tensor = True
     for left in reversed(range(iterations)):
-        normal = jacobian.mT @ jacobian
-        size = normal.diagonal(dim1=1, dim2=2).mean(1)[:, None, None].clamp(min=1e-12)
-        pull = (jacobian.mT @ error[..., None])[..., 0]
+        if helped:
+            normal = jacobian.mT @ jacobian
+            size = normal.diagonal(dim1=1, dim2=2).mean(1)[:, None, None].clamp(min=1e-12)
+            pull = (jacobian.mT @ error[..., None])[..., 0]
         move = torch.linalg.solve_ex(normal + factor * size * eye, pull)[0]
         tried = torch.minimum(torch.maximum(best - move, low), high)
         place, value = _traced(residual, tried)
@@ -45,8 +47,10 @@ def least_squares(
         best = torch.where(better[:, None], tried, best)
         if left == 0:
             break
-        error = torch.where(better[:, None], new_error, error)
-        jacobian = torch.where(better[:, None, None], _jacobian(place, value), jacobian)
+        helped = better.any()
+        if helped:  # a slope costs more than all else here
+            error = torch.where(better[:, None], new_error, error)
+            jacobian = torch.where(better[:, None, None], _jacobian(place, value), jacobian)
         factor = torch.where(better[:, None, None], 0.1 * factor, 10.0 * factor).clamp(1e-6, 1e6)
     return best
 

@@ -73,11 +73,11 @@ def on_accelerator(request):
     return made
 
 
-def test_ten_thousand_poses_agree_with_fcl(organ_scene):
+def test_four_thousand_poses_agree_with_fcl(organ_scene):
     """Within 0.1 mm near contact, and not one collision missed or made up."""
     bodies, scene = organ_scene
     checker = CollisionChecker(bodies)
-    arms = random_arms(10_000, seed=1, points=13)
+    arms = random_arms(4_000, seed=1, points=13)
     found = scene.clearance({"a": arms}).bodies_mm[:, 0, 0].double().numpy()
     shapes = [{"a": ArmShape(line, RADIUS)} for line in arms.double().numpy()]
     hits = np.array([any(c.kind == "body" for c in checker.collisions(s)) for s in shapes])
@@ -86,9 +86,9 @@ def test_ten_thousand_poses_agree_with_fcl(organ_scene):
     error = {i: abs(found[i] - value) for i, value in truth.items()}
     near = [e for i, e in error.items() if truth[i] < batched.EXACT_WITHIN_MM - 0.1]
     far = [e for i, e in error.items() if truth[i] >= batched.EXACT_WITHIN_MM - 0.1]
-    assert len(near) > 1500
+    assert len(near) > 600
     assert max(near) < 1e-4
-    assert len(far) > 300
+    assert len(far) > 120
     assert max(far) < 1.0
     touching = np.abs(found) < 1e-4
     np.testing.assert_array_equal((found < 0)[~touching], hits[~touching])

@@ -49,3 +49,12 @@ def test_of_several_starts_the_best_result_is_taken():
         part, target = Part(torch.tensor([[start]])), torch.tensor([[3.0]])
         found = action_towards(Jumping(), part, target, error, 0.1)
         assert found.item() == pytest.approx(expected)
+
+
+def test_a_row_that_is_solved_does_not_hold_the_others():
+    """Roots of 4, 9, 2 and 3; the first row begins at its own, so that no step helps it."""
+    target = torch.tensor([[4.0, 9.0], [2.0, 3.0]])
+    start = torch.tensor([[2.0, 3.0], [1.0, 1.0]])
+    low, high = torch.zeros_like(start), torch.full_like(start, 10.0)
+    found = least_squares(lambda x: x.square() - target, start, low, high, iterations=8)
+    torch.testing.assert_close(found, target.sqrt(), rtol=0.0, atol=1e-5)

@@ -331,18 +331,35 @@ def test_an_arm_in_degrees_follows_a_path(tripod, tmp_path):
     """Its 90 degrees stand for 70 kPa. The circle is level with the straight arm, above the tips
     that an arc of constant length reaches: the expert holds the tip at the nearest of them."""
     save_model(tripod("deg", 90.0), tmp_path / "arm")
-    config = TrackConfig(FollowConfig(arm=str(tmp_path / "arm"), loop_s=5.0))
+    small = {"size_mm": 10.0, "loop_s": 2.5, "approach_s": 2.0}
+    config = TrackConfig(FollowConfig(arm=str(tmp_path / "arm"), **small))
     task = make_task("track_circle", config)
     assert task.world.arms["arm"].high.tolist() == pytest.approx([70.0] * 3)
     found = rollout(task, Scripted(), 1, 0)
     bend = np.linspace(0.01, 0.6, 10_000)
     radius, height = 70.0 * (1.0 - np.cos(bend)) / bend, 70.0 * np.sin(bend) / bend
-    nearest = np.hypot(radius - 10.0, height - 70.0).min()
+    nearest = np.hypot(radius - 5.0, height - 70.0).min()
     assert float(found.mean("error_mm")) == pytest.approx(nearest, abs=0.005)
     with pytest.raises(InputError, match="is driven in deg, and a rig needs kPa"):
         on_rig(task)
     with pytest.raises(InputError, match="driven in deg, and an exported controller needs kPa"):
         ControllerGraph(task, {"arm": torch.nn.Identity()})
+
+
+def test_each_arm_adapts_by_its_own_model(tripod):
+    """What an arm learns does not depend on the model of the arm before it."""
+    config = WorldConfig(
+        randomisation=Randomisation(gain=0.1), observer=replace(AlphaBetaFilter(), adapts=True)
+    )
+    seen = []
+    for other in (tripod("kPa", 70.0), default_arm()):
+        arms = {"other": Mounted(other, torch.eye(4)), "arm": Mounted(default_arm(), torch.eye(4))}
+        world = World(arms, config)
+        state = world.start(streams(0, 2))
+        for action in actions_of(world, 2, 5):
+            state = world.step(state, action)
+        seen.append(state.arms["arm"].seen_mm)
+    torch.testing.assert_close(seen[0], seen[1], rtol=0.0, atol=1e-6)
 
 
 def test_a_scene_takes_arms_in_psi(tripod, tmp_path):

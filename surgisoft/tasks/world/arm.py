@@ -320,8 +320,13 @@ class ModelArm:
         device: torch.device,
         observer: AlphaBetaFilter | None = None,
         dt_s: float = 0.1,
+        alike: ModelArm | None = None,
     ):
-        """`samples` is the number K of centreline points; dt_s: time of a step of the world, s."""
+        """`samples` is the number K of centreline points; dt_s: time of a step of the world, s.
+
+        alike: an arm of the same model, made with the same arguments but for name and mount; what
+        was computed for it is taken from it.
+        """
         spec = mounted.model.spec
         self.per_kPa = per_kPa = units_per_kPa(spec)
         """The model's actuation for a pressure of 1 kPa, in the model's unit; 1 for kPa."""
@@ -354,8 +359,13 @@ class ModelArm:
             self.samples = len(curve.position)
             matrices = [curve.position, curve.derivative[-1].contiguous()]
         self._drawn = tuple(t.cpu().numpy() for t in (self.shaft, *matrices))
-        self._random_effects = RandomEffects(self.model) if randomisation.effects_mm > 0 else None
-        self._learner = None
+        self._random_effects: RandomEffects | None = None
+        self._learner: DisturbanceEstimator | None = None
+        if alike is not None:
+            self._random_effects, self._learner = alike._random_effects, alike._learner
+            return
+        if randomisation.effects_mm > 0:
+            self._random_effects = RandomEffects(self.model)
         if self.observer.adapts:
             prior = AdaptationPrior(
                 ErrorPrior(push_kPa=per_kPa * ErrorPrior.push_kPa),
@@ -528,13 +538,11 @@ class ModelArm:
         if self._compiled is None or torch.compiler.is_compiling() or torch.jit.is_tracing():
             return None
         graded = torch.is_grad_enabled()
-        if graded and self._compiled.learns:
-            return None
         for tensor in tensors:
             plain = type(tensor) is Tensor and tensor.dtype == torch.float32
             if not plain or (graded and tensor.requires_grad):
                 return None
-        return self._compiled
+        return None if graded and self._compiled.learns else self._compiled
 
     def _stepped(self, step: CompiledStep, part: ArmPart, action: Tensor, dt_s: float) -> ArmPart:
         """The part after a step with the action (B, m) kPa, all but what is measured."""

@@ -150,8 +150,10 @@ class World:
             for name, mounted in arms.items():
                 mounted.model.require_body(f"arm '{name}'")
         c = self.config
-        self.arms: dict[str, Arm] = {
-            name: ModelArm(
+        self.arms: dict[str, Arm] = {}
+        made: dict[int, ModelArm] = {}
+        for name, mounted in arms.items():
+            arm = ModelArm(
                 name,
                 mounted,
                 c.pneumatics,
@@ -160,9 +162,9 @@ class World:
                 self.device,
                 c.observer,
                 c.dt_s,
+                made.get(id(mounted.model)),
             )
-            for name, mounted in arms.items()
-        }
+            self.arms[name] = made[id(mounted.model)] = arm
 
     def start(self, stream: Stream) -> WorldState:
         """Start an episode of the world for each of the (B,) random number streams."""
@@ -366,11 +368,13 @@ def scene_world(
     scene = scene if isinstance(scene, Scene) else open_scene(scene)
     agents = tuple(scene.spec.arms if agents is None else agents)
     check_arms(scene, agents)
-    arms = {}
+    arms, models = {}, {}
     for arm_name, mount in scene.spec.arms.items():
         pose = torch.tensor(mount.pose(), dtype=torch.float32)
         name, folder = (mount.arm, scene.folder) if arm is None else (arm, ".")
-        model = named_arm(name, device, folder)
+        if name not in models:
+            models[name] = named_arm(name, device, folder)
+        model = models[name]
         if arm is not None:
             _check_length(model, mount, scene, arm)
         arms[arm_name] = Mounted(model, pose, shaft_mm=mount.shaft_mm)

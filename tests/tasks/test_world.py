@@ -331,14 +331,13 @@ def test_an_arm_in_degrees_follows_a_path(tripod, tmp_path):
     """Its 90 degrees stand for 70 kPa. The circle is level with the straight arm, above the tips
     that an arc of constant length reaches: the expert holds the tip at the nearest of them."""
     save_model(tripod("deg", 90.0), tmp_path / "arm")
-    small = {"size_mm": 10.0, "loop_s": 2.5, "approach_s": 2.0}
-    config = TrackConfig(FollowConfig(arm=str(tmp_path / "arm"), **small))
+    config = TrackConfig(FollowConfig(arm=str(tmp_path / "arm"), loop_s=5.0))
     task = make_task("track_circle", config)
     assert task.world.arms["arm"].high.tolist() == pytest.approx([70.0] * 3)
     found = rollout(task, Scripted(), 1, 0)
     bend = np.linspace(0.01, 0.6, 10_000)
     radius, height = 70.0 * (1.0 - np.cos(bend)) / bend, 70.0 * np.sin(bend) / bend
-    nearest = np.hypot(radius - 5.0, height - 70.0).min()
+    nearest = np.hypot(radius - 10.0, height - 70.0).min()
     assert float(found.mean("error_mm")) == pytest.approx(nearest, abs=0.005)
     with pytest.raises(InputError, match="is driven in deg, and a rig needs kPa"):
         on_rig(task)

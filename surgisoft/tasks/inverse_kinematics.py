@@ -33,7 +33,7 @@ def least_squares(
     place, value = _traced(residual, best)
     error, jacobian = value.detach(), _jacobian(place, value)
     eye = torch.eye(best.shape[1], dtype=best.dtype, device=best.device)
-    helped: bool | Tensor = True
+    helped = True
     for left in reversed(range(iterations)):
         if helped:
             normal = jacobian.mT @ jacobian
@@ -47,8 +47,9 @@ def least_squares(
         best = torch.where(better[:, None], tried, best)
         if left == 0:
             break
-        helped = better.any()
-        if helped:  # a slope costs more than all else here
+        # A slope costs more than all else here. A GPU does not wait for the answer.
+        helped = best.is_cuda or bool(better.any())
+        if helped:
             error = torch.where(better[:, None], new_error, error)
             jacobian = torch.where(better[:, None, None], _jacobian(place, value), jacobian)
         factor = torch.where(better[:, None, None], 0.1 * factor, 10.0 * factor).clamp(1e-6, 1e6)

@@ -205,7 +205,7 @@ def test_the_form_of_an_effect_is_chosen_beside_the_others(recited):
     """Gains that were fitted alone have taken over some of the drift, and what is left looks like
     gains that drift."""
     recited(said("identified", "gain_mismatch"), said("identified", "drift"), said("cannot_tell"))
-    result = improve(bare_arm(), [measured_on(yielding(), rows=250)])
+    result = improve(bare_arm(), [measured_on(yielding(), rows=400)])
     assert [r.step for r in result.rounds if r.step != NETWORK] == ["gain_mismatch", "drift", None]
     assert result.model.effects["drift"].kind == "base"
     assert result.held_out.after < 1.15 * math.sqrt(3) * NOISE_MM

@@ -171,9 +171,9 @@ def faster_than_fit(spec: ArmSpec, recordings: list[Recording]) -> list[str]:
     )
     percent = float(f"{100 * came:.2g}")
     return [
-        f"the actuation moves by {percent:g} % of its range in a second, {slow}: effects of speed "
-        "may have been missing ever since; fit the model to motion as fast as this, too, or give "
-        "'surgisoft diagnose' the recordings of the fit by --before, to find what has changed"
+        f"the actuation moves by {percent:g} % of its range in a second, {slow}: the model may "
+        "have lacked effects of speed from the start; fit it to motion as fast as this, too, or "
+        "give 'surgisoft diagnose' the recordings of the fit by --before, to find what has changed"
     ]
 
 

@@ -1,12 +1,17 @@
 """Errors by hand, floors of known noise, and the same numbers from the command line."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from surgisoft.diagnosis.compare import compare
+from surgisoft.diagnosis.design.next_experiment import next_experiment
+from surgisoft.diagnosis.diagnose import diagnose
+from surgisoft.diagnosis.improve import improve
+from surgisoft.diagnosis.inputs import open_inputs
 from surgisoft.diagnosis.pages.pictures import draw_all
 from surgisoft.diagnosis.residuals import noise_of, residual_table
 from surgisoft.errors import InputError
@@ -180,6 +185,31 @@ def test_a_still_chamber_is_ignored_and_its_motion_noted():
     notes = outside_range(spec, [recording(still.key_points_mm, moved)])
     assert len(notes) == 1
     assert "chamber 2 goes from 22.9" in notes[0]
+
+
+def test_fast_motion_is_noted_unless_a_change_is_asked_about(monkeypatch):
+    """Chamber 1 moves through its range in 2 s, in the fit in 20 s."""
+    slow = replace(still_model().spec, speed_per_s=0.05)
+    model = ArmModel(slow, still_model().network, rest_mm=torch.tensor(POINTS)).eval()
+    fast = recording(np.random.default_rng(0).normal(POINTS, 0.1, (21, 3, 3)))
+    before = replace(fast, name="before", key_points_mm=fast.key_points_mm + 1.0)
+    (note,) = (text for text in open_inputs(model, [fast])[2] if "as fast as in" in text)
+    assert note.startswith("the actuation moves by 50 % of its range in a second, 10 times as fast")
+    assert not any("as fast" in text for text in open_inputs(model, [fast], compared=True)[2])
+
+    def told(*_, compared=False, **__):
+        raise InputError(f"compared: {compared}")
+
+    for module, asked in (
+        ("diagnose", diagnose),
+        ("improve", improve),
+        ("design.next_experiment", next_experiment),
+    ):
+        monkeypatch.setattr(f"surgisoft.diagnosis.{module}.open_inputs", told)
+        with pytest.raises(InputError, match="compared: False"):
+            asked(model, [fast])
+        with pytest.raises(InputError, match="compared: True"):
+            asked(model, [fast], before=[before])
 
 
 def test_a_tip_that_was_never_seen_is_null_not_nan():

@@ -13,7 +13,7 @@ force, which may have been fitted to other robots of these simulators.
 
 import argparse
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -28,6 +28,8 @@ from surgisoft.surrogate.checkpoint import load_model
 
 SURE = 0.8
 """Confidence from which a wrong name is counted."""
+NAMES = ("without", "given")
+"""Fields of the two answers of a case."""
 
 
 @dataclass(frozen=True)
@@ -103,11 +105,12 @@ def asked(source: str, folder: Path, truth_file: Path, models: Path) -> Asked:
     )
 
 
-def rows(cases: Sequence[Asked]) -> list[tuple[str, str, str]]:
+def rows(cases: Sequence[Asked]) -> list[tuple[str, ...]]:
     """(question, count without the recordings from before, count with them) of some cases."""
 
-    def counted(question: str, some: Iterable[Asked], hit) -> tuple[str, str, str]:
-        some = list(some)
+    def counted(
+        question: str, some: Sequence[Asked], hit: Callable[[Asked, Answer], bool]
+    ) -> tuple[str, ...]:
         count = [sum(hit(case, getattr(case, name)) for case in some) for name in NAMES]
         return (question, *(f"{number} of {len(some)}" for number in count))
 
@@ -154,10 +157,6 @@ def rows(cases: Sequence[Asked]) -> list[tuple[str, str, str]]:
     ]
 
 
-NAMES = ("without", "given")
-"""The answers of a case."""
-
-
 def markdown(cases: Sequence[Asked]) -> str:
     """The table: motion as in the fit, and faster motion."""
     slow = rows([case for case in cases if not case.faster])
@@ -172,24 +171,26 @@ def markdown(cases: Sequence[Asked]) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
-    """Ask all cases, and print the table of each source and of all."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Ask all cases that the log lacks, and print the table of each source and of all."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folders", nargs="+", help="NAME=FOLDER of cases")
     parser.add_argument("--models", type=Path, default=Path("runs/without_before/models"))
     parser.add_argument("--log", type=Path, default=Path("runs/without_before/answers.jsonl"))
-    given = parser.parse_args()
-    given.log.parent.mkdir(parents=True, exist_ok=True)
+    given = parser.parse_args(arguments)
     lines = given.log.read_text().splitlines() if given.log.exists() else []
     done = {(case.source, case.case): case for case in map(Asked.read, lines)}
     for each in given.folders:
         source, _, name = each.partition("=")
         folder = Path(name)
-        files = sorted(folder.glob("**/truth.json"))
+        files = sorted(folder.glob("**/truth.json")) if name else []
+        if not files:
+            parser.error(f"'{each}' has no cases (truth.json), expected NAME=FOLDER of cases")
         for number, file in enumerate(files):
             key = (source, str(file.parent.relative_to(folder)))
             if key not in done:
                 done[key] = asked(source, folder, file, given.models)
+                given.log.parent.mkdir(parents=True, exist_ok=True)
                 with given.log.open("a") as log:
                     print(done[key].line, file=log)
             print(f"{source}: {number + 1} of {len(files)}", flush=True)

@@ -5,9 +5,10 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from benchmarks import without_before
-from benchmarks.without_before import Answer, Asked, asked, markdown, rows
+from benchmarks.without_before import Answer, Asked, asked, main, markdown, rows
 from surgisoft.measurement.histories import arm_spec
 from surgisoft.measurement.recordings import Recording, save_recording
 
@@ -75,3 +76,18 @@ def test_a_case_is_asked_both_ways_and_read_again(tmp_path, monkeypatch):
     found = asked("chain", tmp_path, tmp_path / "cases/001/truth.json", tmp_path)
     assert found == case(("creep",), WRONG, RIGHT, size=1.5, faster=True)
     assert Asked.read(found.line) == found
+
+
+@pytest.mark.parametrize("given", ["chain", "chain=", "chain=nowhere"])
+def test_a_folder_without_cases_is_refused_and_nothing_written(
+    given, tmp_path, monkeypatch, capsys
+):
+    """Cases in the working directory are not taken for those of a folder without a name."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "truth.json").write_text("{}")
+    log = tmp_path / "new" / "answers.jsonl"
+    with pytest.raises(SystemExit) as ended:
+        main([given, "--log", str(log)])
+    assert ended.value.code == 2
+    assert "expected NAME=FOLDER of cases" in capsys.readouterr().err
+    assert not log.parent.exists()

@@ -67,7 +67,7 @@ class Fitted:
 
 @dataclass(frozen=True, eq=False)
 class _Ended:
-    """Fits of named effects that have ended."""
+    """Named effects that were fitted to the end, before their intervals are computed."""
 
     model: ArmModel
     names: list[str]

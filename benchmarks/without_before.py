@@ -4,11 +4,12 @@
 
 A model may lack more than what has changed: what its network cannot do, and effects of speed where
 the arm never moved fast when it was recorded for the fit. `diagnose MODEL AFTER` asks what the
-model lacks, `diagnose MODEL AFTER --before BEFORE` what has changed. The cases state what has
-changed. Each is asked both ways (`--refit never`), with the robot's model
-(`benchmarks.decision.folders`), and the table tells motion that is faster than that of the fit
-(`surgisoft.measurement.histories.faster_than_fit`) from other motion. The decision is the one in
-force, which may have been fitted to other robots of these simulators.
+model lacks, `diagnose MODEL AFTER --before BEFORE` what has changed. Where the motion is faster
+than that of the fit (`surgisoft.measurement.histories.faster_than_fit`), the first also tells what
+has changed since the fit. The cases state what has changed. Each is asked both ways (`--refit
+never`), with the robot's model (`benchmarks.decision.folders`), and the table tells faster motion
+from other motion. The decision is the one in force, which may have been fitted to other robots of
+these simulators.
 """
 
 import argparse
@@ -28,8 +29,10 @@ from surgisoft.surrogate.checkpoint import load_model
 
 SURE = 0.8
 """Confidence from which a wrong name is counted."""
-NAMES = ("without", "given")
-"""Fields of the two answers of a case."""
+SLOW = ("without", "given")
+"""Fields of the answers of a case whose motion is that of the fit."""
+FAST = ("without", "since_fit", "given")
+"""Fields of the answers of a case whose motion is faster."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,10 @@ class Answer:
     def named(self) -> frozenset[str]:
         """The effects that it names."""
         return frozenset(self.effects if self.kind in NAMING else ())
+
+
+NOT_TOLD = Answer("not_told", (), 0.0)
+"""Where a diagnosis does not tell what has changed since the fit."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +74,8 @@ class Asked:
     """Answer from the recordings after the change alone."""
     given: Answer
     """Answer with those from before."""
+    since_fit: Answer = NOT_TOLD
+    """What has changed since the fit, from the recordings after the change and the model."""
 
     @property
     def line(self) -> str:
@@ -77,7 +86,7 @@ class Asked:
     def read(cls, line: str) -> "Asked":
         """The case of a line."""
         values = json.loads(line)
-        for key in ("without", "given"):
+        for key in FAST:
             said = values[key]
             values[key] = Answer(said["kind"], tuple(said["effects"]), said["confidence"])
         return cls(**values | {"truth": tuple(values["truth"])})
@@ -90,10 +99,11 @@ def asked(source: str, folder: Path, truth_file: Path, models: Path) -> Asked:
     model = load_model(model_folder(folder, truth["robot"], models))
     after = load_recordings(truth_file.parent / "after")
     before = load_recordings(robot_folder(folder, truth["robot"]) / "before")
-    verdicts = [
-        diagnose(model, after, before=each, refit="never").verdict for each in (None, before)
+    alone, given = (diagnose(model, after, before=each, refit="never") for each in (None, before))
+    answers = [
+        Answer(said.kind, tuple(said.effects), said.confidence) if said else NOT_TOLD
+        for said in (alone.verdict, given.verdict, alone.since_fit)
     ]
-    answers = [Answer(each.kind, tuple(each.effects), each.confidence) for each in verdicts]
     return Asked(
         source=source,
         case=str(truth_file.parent.relative_to(folder)),
@@ -102,16 +112,17 @@ def asked(source: str, folder: Path, truth_file: Path, models: Path) -> Asked:
         faster=bool(faster_than_fit(model.spec, after)),
         without=answers[0],
         given=answers[1],
+        since_fit=answers[2],
     )
 
 
-def rows(cases: Sequence[Asked]) -> list[tuple[str, ...]]:
-    """(question, count without the recordings from before, count with them) of some cases."""
+def rows(cases: Sequence[Asked], names: Sequence[str] = SLOW) -> list[tuple[str, ...]]:
+    """(question, count of each of the named answers) of some cases."""
 
     def counted(
         question: str, some: Sequence[Asked], hit: Callable[[Asked, Answer], bool]
     ) -> tuple[str, ...]:
-        count = [sum(hit(case, getattr(case, name)) for case in some) for name in NAMES]
+        count = [sum(hit(case, getattr(case, name)) for case in some) for name in names]
         return (question, *(f"{number} of {len(some)}" for number in count))
 
     large = [case for case in cases if OTHER not in case.truth and case.size >= 1.0]
@@ -160,11 +171,11 @@ def rows(cases: Sequence[Asked]) -> list[tuple[str, ...]]:
 def markdown(cases: Sequence[Asked]) -> str:
     """The table: motion as in the fit, and faster motion."""
     slow = rows([case for case in cases if not case.faster])
-    fast = rows([case for case in cases if case.faster])
+    fast = rows([case for case in cases if case.faster], FAST)
     lines = [
         "| what is asked | AFTER alone | with `--before` | faster than in the fit: AFTER alone "
-        "| with `--before` |",
-        "|---|---|---|---|---|",
+        "| since the fit | with `--before` |",
+        "|---|---|---|---|---|---|",
     ]
     for (question, *first), (_, *second) in zip(slow, fast, strict=True):
         lines.append(f"| {' | '.join([question, *first, *second])} |")

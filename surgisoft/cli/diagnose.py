@@ -236,6 +236,8 @@ def _show(found) -> None:
     print(f"{verdict.kind}: {verdict.sentence}")
     for name, words in found.in_words:
         print(f"{name}, first estimate: {words}")
+    if found.since_fit:
+        print(found.since_fit.sentence)
     if found.setup:
         _show_setup(found.setup)
         print(f"{found.seconds:.1f} s")

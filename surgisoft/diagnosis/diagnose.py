@@ -62,11 +62,12 @@ from surgisoft.diagnosis.inputs import (
     refuse_amended,
     with_known_residuals,
 )
+from surgisoft.diagnosis.known_error import known_error, rows_of_fit
 from surgisoft.diagnosis.other_models import open_model
 from surgisoft.diagnosis.pairs import BeforeAfter, Change, ChangeTrack, Paired, before_and_after
 from surgisoft.diagnosis.refit import LINE_OR_WALL, Refit, beside, can_hide, refit_reason
 from surgisoft.diagnosis.refit import refit as fit_candidates_together
-from surgisoft.diagnosis.residuals import Problem, Sealed, residual_table
+from surgisoft.diagnosis.residuals import Problem, ResidualTable, Sealed, residual_table
 from surgisoft.diagnosis.selection import (
     Findings,
     Score,
@@ -78,7 +79,7 @@ from surgisoft.diagnosis.setup import SetupResult, find_setup_faults
 from surgisoft.diagnosis.testability import NotTestable, testable
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.files import with_former_keys
-from surgisoft.measurement.histories import check_fits
+from surgisoft.measurement.histories import check_fits, faster_than_fit
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
@@ -117,6 +118,11 @@ LOCAL = 3.0
 error is called local. Chosen on three robots of a trial, 36 blocks each, between the largest ratio
 of an unchanged arm (2.5) and the least one of an arm that touched a wall (3.2). It adds a check,
 and no result depends on it."""
+NO_PAST = (
+    "the model does not keep what is needed to tell what has changed since its fit: give the "
+    "recordings of the fit by --before"
+)
+"""Note on motion faster than that of the fit where `changed_since_fit` gives nothing."""
 MOST_FITTED = 3
 """Most effects that a fit is recommended with; `fit` takes those that lower its held-out error."""
 REASONS = {
@@ -300,6 +306,9 @@ class Diagnosis:
     """Share 0..1 of the rows looked at that the model was fitted to; None where it does not say."""
     along: ErrorAlong | None = None
     """The error (in a paired difference: the change) along the recordings; None without a clock."""
+    since_fit: Verdict | None = None
+    """What has changed since the fit of the model, where the arm moves faster than it did then;
+    None elsewhere, and where the model keeps too little of its fit."""
 
     @property
     def left_out(self) -> str:
@@ -433,6 +442,11 @@ def diagnose(
             result = with_refit(result, joint, problem)
         if result.verdict.kind == "unknown_effect":
             result = with_axis(result, problem)
+        if reference is None and not problem.in_fit and faster_than_fit(model.spec, whole):
+            report("what has changed since the fit")
+            changed = changed_since_fit(table, without)
+            result = replace(result, since_fit=changed)
+            notes = notes if changed else (*notes, NO_PAST)
     if result.next_command.startswith("surgisoft amend"):
         unknown = not held_out_in_fit(model, whole, table.held_out)
         result = replace(result, next_command=amend_command(result, unknown))
@@ -448,6 +462,26 @@ def reason_of_result(verdict: Verdict) -> str:
     """
     learned = verdict.kind == "cannot_tell" and verdict.reason == "learned"
     return "the network has learned part of what is missing" if learned else ""
+
+
+def changed_since_fit(table: ResidualTable, without: Collection[str] = ()) -> Verdict | None:
+    """What has changed since a model was fitted, by the rows that it keeps of its fit.
+
+    A model may lack an effect of speed from the start that the slower motion of its fit hardly
+    shows. What it got wrong then is subtracted (`known_error`). None where the model does not keep
+    what came before these rows.
+    """
+    kept = table.model.training_residuals
+    known = None if kept is None else rows_of_fit(kept, table.spec)
+    if known is None:
+        return None
+    problem = known_error(table, known).problem_of(table)
+    found, _ = findings_of(problem, lambda text: None, without)
+    evidence = evidence_of(found)
+    decision = of_change(decide(evidence), evidence)
+    result = with_less(result_of(found, decision, evidence), found)
+    sentence = f"since the fit of the model: {result.verdict.sentence}"
+    return replace(result.verdict, sentence=sentence)
 
 
 def diagnose_change(

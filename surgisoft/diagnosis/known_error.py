@@ -4,9 +4,10 @@ Where recordings from before a change were made with another actuation, no paire
 taken. What the model lacked before the change (damping, a swing, loops of its own) is still in the
 residuals afterwards and resembles the effects of the list. It is learned from BEFORE, by a ridge
 regression without physics on the actuation, its past, and products of the past with the present,
-and is subtracted from the residuals of AFTER. Its error on motions of BEFORE that were left out of
-its fit replaces, in proportion, the model's validated error. Where nothing can be learned, the
-penalty is large and nothing is subtracted.
+and is subtracted from the residuals of AFTER. The rows of its fit that a model keeps can take the
+place of BEFORE: what is left has changed since the fit. The error on motions of BEFORE that were
+left out of the regression replaces, in proportion, the model's validated error. Where nothing can
+be learned, the penalty is large and nothing is subtracted.
 """
 
 from dataclasses import dataclass, replace
@@ -15,7 +16,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from surgisoft.diagnosis.history_features import Memory
+from surgisoft.diagnosis.history_features import Memory, memory_of
 from surgisoft.diagnosis.residuals import (
     FOLDS,
     MOTION_ALIKE,
@@ -29,6 +30,8 @@ from surgisoft.diagnosis.residuals import (
 )
 from surgisoft.diagnosis.statistics import cross_validated_ridge
 from surgisoft.surrogate.arm import ArmSpec
+from surgisoft.surrogate.history import pack
+from surgisoft.surrogate.training_residuals import TrainingResiduals
 
 KNOWN_ROWS = 6000
 """Most rows of BEFORE that its error is learned from; more are thinned evenly."""
@@ -68,49 +71,101 @@ class KnownError:
         )
 
 
-def known_error(after: ResidualTable, before: ResidualTable) -> KnownError:
-    """Learn what a model gets wrong on BEFORE, and predict it for AFTER."""
+@dataclass(frozen=True, eq=False)
+class KnownRows:
+    """R rows on which a model's error is known: of recordings from before, or of its fit."""
+
+    inputs: np.ndarray
+    """(R, F) what the error is learned from."""
+    residual_mm: np.ndarray
+    """(R, n, 3) measured less predicted, base frame, mm; NaN where missing."""
+    block: np.ndarray
+    """(R,) block of time in which the motion of the row came for the first time: 0, 1, ..."""
+    pressure: np.ndarray
+    """(R, m) actuation, scaled to [-1, 1] over the model's range."""
+    direction: np.ndarray
+    """(R, m) direction of change of the chambers."""
+
+
+def rows_before(before: ResidualTable) -> KnownRows:
+    """The rows of recordings from before a change."""
     rows = np.flatnonzero(np.isfinite(before.residual_mm).all(2).any(1))
     rows = rows[:: max(1, -(-len(rows) // KNOWN_ROWS))]
-    known, asked = _inputs(before.memory, before.spec, rows), _inputs(after.memory, after.spec)
+    state = motion_states(before.history, half_range(before.spec))
+    return KnownRows(
+        inputs=_inputs(before.memory, before.spec, rows),
+        residual_mm=before.residual_mm[rows],
+        block=_first_blocks(state, before.t_s, before.run, rows),
+        pressure=before.scaled_pressure[rows],
+        direction=before.direction[rows],
+    )
+
+
+def rows_of_fit(known: TrainingResiduals, spec: ArmSpec) -> KnownRows | None:
+    """The rows that a model keeps of its fit; None where it does not keep what came before them."""
+    past = known.past
+    if past is None or not len(past.row):
+        return None
+    runs = torch.unique_consecutive(past.run, return_counts=True)[1].tolist()
+    parts = [torch.split(each, runs) for each in (past.t_s, past.actuation)]
+    nowhere = [torch.full((count, 1, 3), torch.nan) for count in runs]
+    history = pack(list(parts[0]), list(parts[1]), nowhere)
+    rows = past.row.numpy()
+    half = half_range(spec)
+    memory = memory_of(history, spec)
+    return KnownRows(
+        inputs=_inputs(memory, spec, rows),
+        residual_mm=known.residual_mm.double().numpy(),
+        block=_first_blocks(motion_states(history, half), past.t_s.numpy(), past.run.numpy(), rows),
+        pressure=(known.actuation.double().numpy() - np.array(spec.low)) / half - 1.0,
+        direction=known.direction.double().numpy(),
+    )
+
+
+def known_error(after: ResidualTable, known: KnownRows) -> KnownError:
+    """Learn what a model gets wrong on rows from before, and predict it for AFTER."""
+    asked = _inputs(after.memory, after.spec)
     # Beyond what BEFORE has shown nothing was learned.
-    asked = np.clip(asked, known.min(axis=0), known.max(axis=0))
-    block = _first_blocks(before, rows)
+    asked = np.clip(asked, known.inputs.min(axis=0), known.inputs.max(axis=0))
+    block = known.block
     fold = np.random.default_rng(0).permutation(int(block.max()) + 1)[block] % FOLDS
-    target = before.residual_mm[rows].reshape(len(rows), -1)
+    count = len(block)
+    target = known.residual_mm.reshape(count, -1)
     nothing = np.full((len(asked), target.shape[1]), np.nan)
     found = cross_validated_ridge(
-        np.concatenate([known, asked]),
+        np.concatenate([known.inputs, asked]),
         np.concatenate([target, nothing]),
         np.append(fold, np.full(len(asked), fold.max() + 1)),
         KNOWN_PENALTIES,
     ).predicted
-    left = target - found[: len(rows)]
+    left = target - found[:count]
     ratio = float(np.sqrt(np.nansum(np.square(left)) / max(np.nansum(np.square(target)), 1e-30)))
-    shape = before.residual_mm.shape[1:]
-    some = slice(None, None, max(1, -(-len(rows) // ROWS)))
+    shape = known.residual_mm.shape[1:]
+    some = slice(None, None, max(1, -(-count // ROWS)))
     return KnownError(
-        correction_mm=found[len(rows) :].reshape(-1, *shape) if ratio < 1.0 else np.zeros(1),
+        correction_mm=found[count:].reshape(-1, *shape) if ratio < 1.0 else np.zeros(1),
         ratio=min(ratio, 1.0),
         reference=Reference(
-            pressure=before.scaled_pressure[rows][some],
-            direction=before.direction[rows][some],
+            pressure=known.pressure[some],
+            direction=known.direction[some],
             residual=(left if ratio < 1.0 else target)[some].reshape(-1, *shape),
         ),
     )
 
 
-def _first_blocks(before: ResidualTable, rows: np.ndarray) -> np.ndarray:
-    """(R,) block of time of BEFORE in which the motion of each of R rows came for the first time.
+def _first_blocks(
+    state: np.ndarray, t_s: np.ndarray, run: np.ndarray, rows: np.ndarray
+) -> np.ndarray:
+    """(R,) block of time in which the motion of each of R rows came for the first time.
 
-    Where BEFORE repeats a motion, what is learned of the motion from its own repeats would be no
-    test of what is known of the motions of AFTER. Rows with the same actuation and the same past
+    state: (N, k) motion of all rows (`motion_states`); t_s, run: (N,) their time and run. Where
+    BEFORE repeats a motion, what is learned of the motion from its own repeats would be no test of
+    what is known of the motions of AFTER. Rows with the same actuation and the same past
     (`residuals.MOTION_ALIKE`) are held out together.
     """
-    state = motion_states(before.history, half_range(before.spec))[rows]
-    near = cKDTree(state).query_ball_point(state, MOTION_ALIKE, p=np.inf)
+    near = cKDTree(state[rows]).query_ball_point(state[rows], MOTION_ALIKE, p=np.inf)
     first = rows[[min(some) for some in near]]
-    part = before.run[first] * 1e6 + before.t_s[first] // KNOWN_BLOCK_S
+    part = run[first] * 1e6 + t_s[first] // KNOWN_BLOCK_S
     return np.unique(part, return_inverse=True)[1]
 
 

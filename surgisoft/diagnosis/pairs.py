@@ -30,7 +30,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 
 from surgisoft.diagnosis.abrupt import body_jumps, own_jumps_mm
 from surgisoft.diagnosis.discrepancy import LENGTHS
-from surgisoft.diagnosis.known_error import known_error
+from surgisoft.diagnosis.known_error import known_error, rows_before
 from surgisoft.diagnosis.residuals import (
     BLOCK_ROWS,
     LEAST_BLOCKS,
@@ -1070,7 +1070,7 @@ class BeforeAfter:
         """The training rows of AFTER; without pairs less what the model got wrong on BEFORE."""
         if self.used:
             return self.table.training(rows)
-        return known_error(self.plain, self.earlier).problem_of(self.plain, rows)
+        return known_error(self.plain, rows_before(self.earlier)).problem_of(self.plain, rows)
 
     def track(self, problem: Problem, explained_mm: np.ndarray) -> ChangeTrack:
         """The change along the rows of a problem, of which effects explain (S, n, 3) mm."""

@@ -172,8 +172,8 @@ def faster_than_fit(spec: ArmSpec, recordings: list[Recording]) -> list[str]:
     percent = float(f"{100 * came:.2g}")
     return [
         f"the actuation moves by {percent:g} % of its range in a second, {slow}: the model may "
-        "have lacked effects of speed from the start; fit it to motion as fast as this, too, or "
-        "give 'surgisoft diagnose' the recordings of the fit by --before, to find what has changed"
+        "have lacked effects of speed from the start; fit it to motion as fast as this, too "
+        "('surgisoft diagnose' tells what has changed since the fit)"
     ]
 
 

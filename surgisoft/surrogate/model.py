@@ -25,7 +25,7 @@ from surgisoft.surrogate.networks import (
     KernelArm,
     RecurrentArm,
 )
-from surgisoft.surrogate.training_residuals import ROWS, TrainingResiduals
+from surgisoft.surrogate.training_residuals import PAST_ROWS, ROWS, Past, TrainingResiduals
 
 AWAY_SHARE = 0.15
 """A run begins away from rest where a chamber's measured actuation is farther from it than this
@@ -155,15 +155,26 @@ class ArmModel(nn.Module):
     @torch.no_grad()
     def residuals_on(self, histories: Iterable[History], rows: int = ROWS) -> TrainingResiduals:
         """Residuals of this model on at most `rows` measured rows of histories, evenly thinned."""
-        parts = []
+        parts, runs = [], 0
         for history in histories:
             residual = history.rows(history.key_points - self.predict(history))
-            seen = (~residual.isnan()).all(-1).any(-1)
             direction = history.rows(self.trace(history).direction)
-            parts.append((history.rows(history.pressure)[seen], direction[seen], residual[seen]))
-        whole = [torch.cat(part) for part in zip(*parts, strict=True)]
-        step = max(1, -(-len(whole[0]) // rows))
-        return TrainingResiduals(*(part[::step].float().contiguous() for part in whole))
+            run = history.run_of_row + runs
+            runs += history.runs
+            given = history.rows(history.t_s), history.rows(history.pressure)
+            parts.append((*given, run, direction, residual))
+        t_s, actuation, run, direction, residual = map(torch.cat, zip(*parts, strict=True))
+        thin = max(1, -(-len(t_s) // PAST_ROWS))
+        kept = torch.arange(0, len(t_s), thin, device=t_s.device)
+        seen = torch.nonzero((~residual[kept].isnan()).all(-1).any(-1)).flatten()
+        row = seen[:: max(1, -(-len(seen) // rows))]
+        chosen = kept[row]
+        return TrainingResiduals(
+            actuation=actuation[chosen].float(),
+            direction=direction[chosen].float(),
+            residual_mm=residual[chosen].float(),
+            past=Past(t_s[kept], actuation[kept].float(), run[kept].int(), row.int()),
+        )
 
     @property
     def chain(self) -> Chain:

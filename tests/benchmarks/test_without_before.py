@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks import without_before
-from benchmarks.without_before import Answer, Asked, asked, main, markdown, rows
+from benchmarks.without_before import NOT_TOLD, Answer, Asked, asked, main, markdown, rows
 from surgisoft.measurement.histories import arm_spec
 from surgisoft.measurement.recordings import Recording, save_recording
 
@@ -20,8 +20,8 @@ UNSURE = Answer("cannot_tell", (), 0.3)
 UNKNOWN = Answer("unknown_effect", (), 0.9)
 
 
-def case(truth, without, given, size=2.0, faster=False):
-    return Asked("chain", "cases/001", truth, size, faster, without, given)
+def case(truth, without, given, size=2.0, faster=False, since_fit=NOT_TOLD):
+    return Asked("chain", "cases/001", truth, size, faster, without, given, since_fit)
 
 
 def test_the_counts_by_hand():
@@ -48,8 +48,10 @@ def test_the_counts_by_hand():
 
 
 def test_faster_motion_has_columns_of_its_own():
-    table = markdown([case((), WRONG, UNSURE, faster=True), case((), UNSURE, UNSURE)])
-    assert "| nothing has changed: something named | 0 of 1 | 0 of 1 | 1 of 1 | 0 of 1 |" in table
+    some = [case((), WRONG, UNSURE, faster=True, since_fit=SET), case((), UNSURE, UNSURE)]
+    some.append(case((), WRONG, WRONG, faster=True, since_fit=UNSURE))
+    said = "| nothing has changed: something named | 0 of 1 | 0 of 1 | 2 of 2 | 1 of 2 | 1 of 2 |"
+    assert said in markdown(some)
 
 
 def test_a_case_is_asked_both_ways_and_read_again(tmp_path, monkeypatch):
@@ -68,14 +70,17 @@ def test_a_case_is_asked_both_ways_and_read_again(tmp_path, monkeypatch):
 
     def diagnose(given, after, before, refit):
         assert (given, refit, [each.name for each in after]) == (model, "never", ["fast"])
-        said = WRONG if before is None else RIGHT
-        assert before is None or [each.name for each in before] == ["slow"]
-        return SimpleNamespace(verdict=said)
+        if before is None:
+            return SimpleNamespace(verdict=WRONG, since_fit=SET)
+        assert [each.name for each in before] == ["slow"]
+        return SimpleNamespace(verdict=RIGHT, since_fit=None)
 
     monkeypatch.setattr(without_before, "diagnose", diagnose)
     found = asked("chain", tmp_path, tmp_path / "cases/001/truth.json", tmp_path)
-    assert found == case(("creep",), WRONG, RIGHT, size=1.5, faster=True)
+    assert found == case(("creep",), WRONG, RIGHT, size=1.5, faster=True, since_fit=SET)
     assert Asked.read(found.line) == found
+    slow = replace(found, faster=False, since_fit=NOT_TOLD)
+    assert Asked.read(slow.line) == slow
 
 
 @pytest.mark.parametrize("given", ["chain", "chain=", "chain=nowhere"])

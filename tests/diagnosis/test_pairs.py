@@ -20,7 +20,7 @@ from surgisoft.diagnosis.diagnose import (
     lacking_before,
     since,
 )
-from surgisoft.diagnosis.known_error import known_error
+from surgisoft.diagnosis.known_error import known_error, rows_before, rows_of_fit
 from surgisoft.diagnosis.pages import diagnosis as page
 from surgisoft.diagnosis.pairs import (
     LEAST_ROWS,
@@ -37,13 +37,14 @@ from surgisoft.diagnosis.pairs import (
 )
 from surgisoft.diagnosis.residuals import LEAST_DISCREPANCY, model_discrepancy, residual_table
 from surgisoft.errors import InputError
-from surgisoft.measurement.histories import history_of
+from surgisoft.measurement.histories import history_of, speed_of
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import Recording, load_recording, save_recording
 from surgisoft.report import charts
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, save_model
 from surgisoft.surrogate.model import Validation
+from surgisoft.surrogate.training_residuals import Past
 from tests.diagnosis.synthetic import NOISE_MM, PERIOD_S, POINTS, recording, still_model, walk
 
 ROWS = 2400
@@ -224,7 +225,7 @@ def test_what_was_wrong_before_is_not_extrapolated(model):
     half = made(lambda t_s: 0.5 * smooth_walk(3)(t_s), 0.0)
     whole = made(smooth_walk(8), 0.0, seed=2)
     before = residual_table(model, [half])
-    found = known_error(residual_table(model, [whole]), before)
+    found = known_error(residual_table(model, [whole]), rows_before(before))
     assert found.ratio < 0.5
     left, error = (np.sqrt(np.mean(x**2)) for x in (found.reference.residual, before.residual_mm))
     assert found.ratio == pytest.approx(left / error, rel=0.05), "of what fits without the row left"
@@ -797,6 +798,61 @@ def test_what_was_wrong_before_is_no_change_without_pairs(model, changed):
     assert np.all(problem.discrepancy_mm < 0.5 * np.array(model.validation.per_key_point_mm))
 
 
+def test_rows_of_a_fit_teach_what_its_recordings_teach(model):
+    """All 1,200 rows of a lag of 2 s are kept."""
+    pressure = smooth_walk(15)(PERIOD_S * np.arange(1200))
+    old = recording(lagging(pressure), pressure, seed=2)
+    motion = smooth_walk(16)(PERIOD_S * np.arange(ROWS))
+    new = residual_table(model, [recording(lagging(motion), motion, seed=3)])
+    expected = known_error(new, rows_before(residual_table(model, [old])))
+    assert expected.ratio < 0.6
+    kept = model.residuals_on([history_of([old])])
+    found = known_error(new, rows_of_fit(kept, model.spec))
+    assert found.ratio == pytest.approx(expected.ratio, rel=1e-3)
+    np.testing.assert_allclose(found.correction_mm, expected.correction_mm, atol=2e-3)
+    np.testing.assert_allclose(found.reference.residual, expected.reference.residual, atol=2e-3)
+    assert rows_of_fit(replace(kept, past=None), model.spec) is None
+
+
+def test_half_of_the_actuation_is_past_enough(model):
+    """Residuals of every second row; before them all rows of the actuation or every second one."""
+    pressure = smooth_walk(15)(PERIOD_S * np.arange(1200))
+    kept = model.residuals_on([history_of([recording(lagging(pressure), pressure, seed=2)])])
+    names = ("actuation", "direction", "residual_mm")
+    some = replace(kept, **{name: getattr(kept, name)[::2] for name in names})
+    row, past = kept.past.row[::2], kept.past
+    every = rows_of_fit(replace(some, past=replace(past, row=row)), model.spec)
+    thin = Past(past.t_s[::2], past.actuation[::2], past.run[::2], row // 2)
+    half = rows_of_fit(replace(some, past=thin), model.spec)
+    assert np.sqrt(np.mean((half.inputs - every.inputs) ** 2)) < 0.1 * every.inputs.std()
+    assert np.array_equal(half.residual_mm, every.residual_mm)
+
+
+@pytest.mark.parametrize("changed", [False, True])
+def test_faster_motion_than_in_the_fit_tells_what_has_changed_since(model, changed):
+    """A lag that the model lacks from the start is no change; a curve of the second chamber is."""
+    slow = smooth_walk(15)(PERIOD_S * np.arange(ROWS))
+    old = recording(lagging(slow), slow, seed=2)
+    fast = smooth_walk(16)(2.0 * PERIOD_S * np.arange(ROWS // 2))
+    gain = 0.3 * fast[:, 1] * changed
+    new = recording(lagging(fast) + gain, fast, seed=3)
+    arm = copy.copy(model)
+    arm.spec = replace(model.spec, speed_per_s=speed_of([old], model.spec.span))
+    arm.training_residuals = arm.residuals_on([history_of([old])])
+    found = diagnose(arm, [new], refit="never")
+    since = found.since_fit
+    assert since.sentence.startswith("since the fit of the model: ")
+    assert found.verdict.kind != "nothing_missing"
+    assert (since.kind == "nothing_missing") != changed
+    assert diagnose(arm, [old], refit="never").since_fit is None, "as fast as in the fit"
+    assert not any("--before" in note for note in found.notes)
+    arm.training_residuals = replace(arm.training_residuals, past=None)
+    without = diagnose(arm, [new], refit="never")
+    assert without.since_fit is None
+    assert without.verdict == found.verdict
+    assert without.notes[-1].endswith("give the recordings of the fit by --before")
+
+
 def test_repeats_of_one_motion_teach_nothing_of_another(model):
     """What is wrong at each instant of a motion comes again with its repeats, and not elsewhere."""
     cycle, repeats = 600, 4
@@ -805,7 +861,7 @@ def test_repeats_of_one_motion_teach_nothing_of_another(model):
     old = recording(np.tile(wrong - wrong.mean(), repeats), np.tile(once, (repeats, 1)), seed=2)
     pressure = smooth_walk(16)(PERIOD_S * np.arange(ROWS))
     new = recording(np.zeros(ROWS), pressure, seed=3)
-    found = known_error(residual_table(model, [new]), residual_table(model, [old]))
+    found = known_error(residual_table(model, [new]), rows_before(residual_table(model, [old])))
     assert found.ratio == 1.0
     assert not found.correction_mm.any()
 

@@ -8,7 +8,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from surgisoft.errors import InputError
-from surgisoft.surrogate.checkpoint import DEFAULT_FOLDER, load_model
+from surgisoft.surrogate.checkpoint import DEFAULT_FOLDER, load_model, save_model
 
 
 @pytest.fixture
@@ -58,6 +58,37 @@ def test_training_residuals_of_other_rows_are_refused(folder):
     with pytest.raises(InputError, match="do not have the same rows"):
         load_model(folder)
     assert torch.equal(known["actuation"], load_model("default").training_residuals.actuation)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "words"),
+    [
+        ("past_row", lambda row: row + 1, "not among those of the actuation over time"),
+        ("past_row", lambda row: row[1:], "does not have the shapes of its rows"),
+        ("past_actuation", lambda values: values[:, 1:], "does not have the shapes of its rows"),
+        ("past_actuation", lambda values: values / 0, "actuation over time is NaN or infinite"),
+        ("past_t_s", lambda t_s: -t_s, "not in order"),
+        ("past_run", lambda run: run.flip(0), "not in order"),
+        ("past_t_s", None, "missing 1 required"),
+    ],
+)
+def test_the_actuation_before_the_residuals_fits_them_or_is_refused(folder, name, change, words):
+    rows, chambers = load_model("default").training_residuals.actuation.shape
+    known = load_file(folder / "known_error.safetensors")
+    count = torch.arange(rows, dtype=torch.int32)
+    past = {"t_s": count * 0.05, "actuation": torch.ones(rows, chambers), "run": count // 700}
+    past = {f"past_{each}": value for each, value in (past | {"row": count}).items()}
+    save_file(known | past, folder / "known_error.safetensors")
+    kept = load_model(folder).training_residuals.past
+    assert torch.equal(kept.row, count)
+    save_model(load_model(folder), folder.parent / "again")
+    again = load_model(folder.parent / "again").training_residuals.past
+    assert all(torch.equal(value, getattr(kept, each)) for each, value in vars(again).items())
+    changed = {} if change is None else {name: change(past.pop(name)).contiguous()}
+    past.pop(name, None)
+    save_file(known | past | changed, folder / "known_error.safetensors")
+    with pytest.raises(InputError, match=words):
+        load_model(folder)
 
 
 def test_key_points_that_the_weights_do_not_have_take_no_memory(folder):

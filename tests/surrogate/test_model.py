@@ -145,6 +145,24 @@ def test_residuals_are_measured_less_predicted_in_rows_that_were_measured():
     torch.testing.assert_close(found.actuation, seen[::2])
 
 
+def test_the_actuation_before_the_residuals_is_kept_and_of_many_rows_every_second(monkeypatch):
+    """Two histories of 20 and 10 rows, the second with two runs of which one has 7 rows."""
+    arm, first, second = model(), walks([20]), walks([10, 7])
+    whole = arm.residuals_on([first, second], rows=12)
+    past = whole.past
+    assert past.run.tolist() == [0] * 20 + [1] * 10 + [2] * 7
+    expected = torch.cat([each.rows(each.t_s) for each in (first, second)])
+    assert torch.equal(past.t_s, expected)
+    assert torch.equal(past.actuation[past.row], whole.actuation)
+    assert past.row.tolist() == list(range(0, 37, 4))
+    monkeypatch.setattr("surgisoft.surrogate.model.PAST_ROWS", 36)
+    half = arm.residuals_on([first, second], rows=12)
+    assert torch.equal(half.past.t_s, expected[::2])
+    assert torch.equal(half.past.run, past.run[::2])
+    assert torch.equal(half.past.actuation[half.past.row], half.actuation)
+    assert torch.equal(half.actuation, whole.past.actuation[::2][::2])
+
+
 def test_parts_that_belong_to_one_fit_are_dropped_with_it():
     """Training residuals are those of network and effects; the rows of the fit stay known."""
     arm, history = model(), walks([20])

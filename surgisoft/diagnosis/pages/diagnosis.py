@@ -52,6 +52,12 @@ HOW_CHANGE = (
     "difference of the actuation corrected by the model. The model's own error is in neither "
     "curve. What an effect explains is to first order; `surgisoft amend --before` fits it."
 )
+HOW_SINCE_FIT = (
+    "The arm moves faster than in the recordings of the fit, so the model may have lacked effects "
+    "of speed from the start. What the model got wrong in the rows that it keeps of its fit was "
+    "learned as a function of the actuation and its past, and subtracted. What is left has changed "
+    "since the fit."
+)
 STRETCHES_SHOWN = 8
 """Pairs of runs that the page lists."""
 STRETCH_S = 20.0
@@ -94,6 +100,9 @@ def diagnosis_page(found: Diagnosis, title: str, command: str = "") -> Page:
             parts.append(_probabilities(found.probabilities))
         if found.next_command:
             parts.append(Section("What to do", [Command(command or found.command())]))
+    if found.since_fit:
+        said = f"{_sentence(found.since_fit.sentence)}\n\n{HOW_SINCE_FIT}"
+        parts.append(Section("Since the fit", [Text(said)]))
     if found.change:
         parts.append(_change(found))
     if found.refit is not None:

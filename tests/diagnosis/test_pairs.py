@@ -3,6 +3,7 @@
 import copy
 import json
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -799,14 +800,16 @@ def test_what_was_wrong_before_is_no_change_without_pairs(model, changed):
 
 
 def test_rows_of_a_fit_teach_what_its_recordings_teach(model):
-    """All 1,200 rows of a lag of 2 s are kept."""
-    pressure = smooth_walk(15)(PERIOD_S * np.arange(1200))
-    old = recording(lagging(pressure), pressure, seed=2)
+    """All 1,200 rows of a lag of 2 s are kept, of two runs of which each begins settled."""
+    signals = [
+        smooth_walk(seed)(PERIOD_S * np.arange(rows)) for seed, rows in ((15, 700), (9, 500))
+    ]
+    old = [recording(lagging(signal), signal, seed=2) for signal in signals]
     motion = smooth_walk(16)(PERIOD_S * np.arange(ROWS))
     new = residual_table(model, [recording(lagging(motion), motion, seed=3)])
-    expected = known_error(new, rows_before(residual_table(model, [old])))
+    expected = known_error(new, rows_before(residual_table(model, old)))
     assert expected.ratio < 0.6
-    kept = model.residuals_on([history_of([old])])
+    kept = model.residuals_on([history_of(old)])
     found = known_error(new, rows_of_fit(kept, model.spec))
     assert found.ratio == pytest.approx(expected.ratio, rel=1e-3)
     np.testing.assert_allclose(found.correction_mm, expected.correction_mm, atol=2e-3)
@@ -851,6 +854,23 @@ def test_faster_motion_than_in_the_fit_tells_what_has_changed_since(model, chang
     assert without.since_fit is None
     assert without.verdict == found.verdict
     assert without.notes[-1].endswith("give the recordings of the fit by --before")
+
+
+def test_what_has_changed_since_the_fit_is_printed(model, tmp_path, monkeypatch, capsys):
+    sentence = "since the fit of the model: a spring is missing"
+    levels = ErrorLevels(1.0, 0.1, 0.2)
+    verdict = Verdict("cannot_tell", (), "cannot tell")
+    found = Diagnosis(verdict, levels, (), since_fit=Verdict("identified", ("spring",), sentence))
+    monkeypatch.setattr("surgisoft.diagnosis.diagnose.diagnose", lambda *_, **__: found)
+    monkeypatch.chdir(tmp_path)
+    save_model(model, "arm")
+    save_recording(made(smooth_walk(3), 0.0, rows=200), tmp_path / "new.parquet")
+    assert run(["diagnose", "arm", "new.parquet", "--report", "page", "--json", "found.json"]) == 0
+    assert capsys.readouterr().out.splitlines()[1] == sentence
+    (written,) = Path("page").glob("*.html")
+    assert "Since the fit of the model: a spring is missing." in written.read_text()
+    said = json.loads(Path("found.json").read_text())["since_fit"]
+    assert (said["kind"], said["effects"], said["sentence"]) == ("identified", ["spring"], sentence)
 
 
 def test_repeats_of_one_motion_teach_nothing_of_another(model):

@@ -166,7 +166,7 @@ def diagnosis(**fields) -> SimpleNamespace:
         "error_mm": ErrorLevels(0.5, 0.05, 0.1, discrepancy_alone=0.45), "track": None,
         "setup": None, "next_command": "", "next_experiment": None, "refit": None, "checks": (),
         "shown": (), "not_testable": (), "implausible": (), "seconds": 1.5, "in_fit": 0.0,
-        "left_out": "held-out blocks", "change": None, "in_words": (),
+        "left_out": "held-out blocks", "change": None, "in_words": (), "since_fit": None,
     }  # fmt: skip
     found = result(**(values | fields))
     found.command = lambda *files: Diagnosis.command(found, *files)

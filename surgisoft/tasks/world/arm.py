@@ -363,15 +363,19 @@ class ModelArm:
         self._learner: DisturbanceEstimator | None = None
         if alike is not None:
             self._random_effects, self._learner = alike._random_effects, alike._learner
-            return
-        if randomisation.effects_mm > 0:
-            self._random_effects = RandomEffects(self.model)
-        if self.observer.adapts:
-            prior = AdaptationPrior(
-                ErrorPrior(push_kPa=per_kPa * ErrorPrior.push_kPa),
-                chambers_kPa=per_kPa * AdaptationPrior.chambers_kPa,
-            )
-            self._learner = DisturbanceEstimator(self.model, dt_s, prior, device)
+        else:
+            if randomisation.effects_mm > 0:
+                self._random_effects = RandomEffects(self.model)
+            if self.observer.adapts:
+                self._learner = self._new_learner(dt_s)
+
+    def _new_learner(self, dt_s: float) -> DisturbanceEstimator:
+        """What learns the arm's difference from its model, with its prior in the model's unit."""
+        prior = AdaptationPrior(
+            ErrorPrior(push_kPa=self.per_kPa * ErrorPrior.push_kPa),
+            chambers_kPa=self.per_kPa * AdaptationPrior.chambers_kPa,
+        )
+        return DisturbanceEstimator(self.model, dt_s, prior, self.device)
 
     def reference(self) -> ModelArm:
         """This arm stepped by differentiable tensor operations alone, which agree to rounding."""

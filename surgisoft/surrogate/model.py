@@ -164,11 +164,12 @@ class ArmModel(nn.Module):
             given = history.rows(history.t_s), history.rows(history.pressure)
             parts.append((*given, run, direction, residual))
         t_s, actuation, run, direction, residual = map(torch.cat, zip(*parts, strict=True))
+        seen = torch.nonzero((~residual.isnan()).all(-1).any(-1)).flatten()
+        chosen = seen[:: max(1, -(-len(seen) // rows))].contiguous()
         thin = max(1, -(-len(t_s) // PAST_ROWS))
-        kept = torch.arange(0, len(t_s), thin, device=t_s.device)
-        seen = torch.nonzero((~residual[kept].isnan()).all(-1).any(-1)).flatten()
-        row = seen[:: max(1, -(-len(seen) // rows))]
-        chosen = kept[row]
+        every = torch.arange(0, len(t_s), thin, device=t_s.device)
+        kept = torch.cat([every, chosen]).unique()
+        row = torch.searchsorted(kept, chosen)
         return TrainingResiduals(
             actuation=actuation[chosen].float(),
             direction=direction[chosen].float(),

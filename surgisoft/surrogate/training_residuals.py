@@ -18,7 +18,7 @@ ROWS = 1500
 """Largest number of rows that are stored."""
 PAST_ROWS = 50_000
 """Largest number of rows of actuation that are stored: 1.2 MB for three chambers. Of more rows (40
-minutes at 20 Hz) every second one is stored, or fewer."""
+minutes at 20 Hz) every second one is stored, or fewer, beside those of the residuals."""
 PAST = "past_"
 """What the names of the arrays of `Past` begin with in the file."""
 

@@ -156,11 +156,15 @@ def test_the_actuation_before_the_residuals_is_kept_and_of_many_rows_every_secon
     assert torch.equal(past.actuation[past.row], whole.actuation)
     assert past.row.tolist() == list(range(0, 37, 4))
     monkeypatch.setattr("surgisoft.surrogate.model.PAST_ROWS", 36)
-    half = arm.residuals_on([first, second], rows=12)
-    assert torch.equal(half.past.t_s, expected[::2])
-    assert torch.equal(half.past.run, past.run[::2])
-    assert torch.equal(half.past.actuation[half.past.row], half.actuation)
-    assert torch.equal(half.actuation, whole.past.actuation[::2][::2])
+    half = arm.residuals_on([first, second], rows=7)
+    assert torch.equal(half.past.t_s, expected[::2]), "every sixth row is one of them"
+    assert torch.equal(half.past.t_s[half.past.row], expected[::6])
+    odd = {*range(0, 37, 2), *range(0, 37, 5)}
+    fifth = arm.residuals_on([first, second], rows=8)
+    assert torch.equal(fifth.past.t_s, expected[sorted(odd)])
+    assert torch.equal(fifth.past.run, past.run[sorted(odd)])
+    assert torch.equal(fifth.past.actuation[fifth.past.row], fifth.actuation)
+    assert torch.equal(fifth.actuation, whole.past.actuation[::5])
 
 
 def test_parts_that_belong_to_one_fit_are_dropped_with_it():

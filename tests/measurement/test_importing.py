@@ -192,6 +192,18 @@ def test_dates_become_seconds(tmp_path):
     written(path, path.read_text().replace("2024-03-01", "1st of March"))
     with pytest.raises(InputError, match=r"a\.csv, line 3, column 't': got '1st of March"):
         imported(tmp_path, path, content)
+    for first in ("", "NaT"):
+        written(path, ",".join(NAMES) + "\n" + rows.replace("2024-02-29T23:59:59.5", first))
+        with pytest.raises(InputError, match=rf"line 2, column 't': got '{first}', expected a da"):
+            imported(tmp_path, path, content)
+
+
+def test_dates_with_an_offset_are_moments(tmp_path):
+    """A quarter to one in Berlin is 1.5 s before a quarter to midnight in London."""
+    rows = "2024-03-01T00:44:58.5+01:00,1,2,3,4,5\n2024-02-29T23:45Z,1,2,3,4,5\n"
+    path = written(tmp_path / "a.csv", ",".join(NAMES) + "\n" + rows)
+    content = BASE.replace('column = "t"', 'column = "t"\nunit = "iso"')
+    np.testing.assert_allclose(imported(tmp_path, path, content)[0].t_s, [0, 1.5], atol=1e-6)
 
 
 def test_times_are_scaled_whose_unit_has_no_name(tmp_path):

@@ -256,6 +256,7 @@ unit = "mm"
         ("clock_offset_s = -0.25", "", 0.25),
         ('clock = "from_start"', "", -2.0),
         ('clock = "from_start"', "scale = 0.5", -1.0),
+        ('clock = "from_start"\nclock_offset_s = -0.25', "", -1.75),
     ],
 )
 def test_the_clock_of_a_second_file_is_shifted_or_begins_with_the_first(

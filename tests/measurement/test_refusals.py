@@ -243,7 +243,11 @@ def imported(folder, map_text: str, *contents: str, name: str | None = "lab"):
             "no column 'p1_kPa' or with another unit, expected the",
         ),
         ('[measured]\nto = "kPa"', RAW.replace("u", "p1_deg", 1), "'deg' cannot be converted to"),
-        (PLAIN + "\n[rows]\nfirst = 9", RAW, "no row is left after joining the files, expected"),
+        (
+            PLAIN + "\n[rows]\nfirst = 9",
+            RAW,
+            "rows is left by [rows] of the map (first = 9, last =",
+        ),
         (PLAIN, re.sub(r",\d,\d,\d\n", ",,,\n", RAW), "every key point is missing in every row"),
     ],
 )

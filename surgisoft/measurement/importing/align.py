@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from surgisoft.measurement.units import SECONDS_PER
 
 SAME_TIME_S = 1e-6
 """Times that differ by no more are the same [s]."""
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+"""Date from which times of dates count; a date without an offset is taken for UTC."""
 LARGEST_GAP_S = 1.0
 """Longest gap of a late log within which it is still read [s]."""
 
@@ -155,11 +158,18 @@ def join(
             columns |= _columns(name, needed, {name: matched}, rows)
             keep &= inside
             _note_time_join(role, table, main, inside, notes)
-    keep &= (rows + 1 >= spec.rows.first) & (rows + 1 <= (spec.rows.last or len(rows)))
+    if not keep.any():
+        why = "".join(f"; {note}" for note in notes)
+        raise InputError(
+            f"{main.path}: no row is left after joining the files, expected common rows or times"
+            + why
+        )
+    first, last = spec.rows.first, spec.rows.last or len(rows)
+    keep &= (rows + 1 >= first) & (rows + 1 <= last)
     if not keep.any():
         raise InputError(
-            f"{main.path}: no row is left after joining the files, expected common rows or times; "
-            + "; ".join(notes)
+            f"{main.path}: none of its {len(rows)} rows is left by [rows] of the map (first = "
+            f"{first}, last = {last}), expected rows of the file that the other files have, too"
         )
     if keep.all():
         return Joined(main, rows, t_s, columns, notes)
@@ -213,7 +223,7 @@ def _by_time(
     A held column keeps the value of the row before (or at) each time; a quaternion turns at a
     constant rate, and the others are linear between the two rows around it.
     """
-    log_s = times(table, role.time, role.time_unit) + role.clock_offset_s
+    log_s = times(table, role.time, role.time_unit)
     back = np.flatnonzero(~(np.diff(log_s) > 0))
     if len(back):
         place = table.cells.place(int(back[0]) + 1)
@@ -223,6 +233,7 @@ def _by_time(
         )
     if role.clock == "from_start":
         log_s, t_s = log_s - log_s[0], t_s - t_s[0]
+    log_s = log_s + role.clock_offset_s
     at = Between.of(log_s, t_s)
     use_held = np.array(held) | (role.interpolate == "previous")
     found = at.linear(values)
@@ -262,12 +273,14 @@ def _dates(table: RawTable, column: Column) -> np.ndarray:
     seconds = []
     for row, text in enumerate(table.texts(column)):
         try:
-            seconds.append(np.datetime64(text.rstrip("Z"), "us").astype(np.int64) * 1e-6)
+            stamp = datetime.fromisoformat(text.strip())
         except ValueError as error:
             raise InputError(
                 f"{table.cells.place(row)}, column '{column}': got {text[:40]!r}, expected a date "
                 "such as 2024-05-01T12:00:00.25"
             ) from error
+        stamp = stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC)
+        seconds.append((stamp - EPOCH) / timedelta(seconds=1))
     return np.array(seconds)
 
 

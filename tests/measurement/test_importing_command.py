@@ -50,6 +50,15 @@ def surgisoft(*arguments):
     return run([str(argument) for argument in arguments])
 
 
+def test_a_model_of_another_arm_is_refused_before_anything_is_written(lab, capsys):
+    out = lab / "rec.csv"
+    given = ["import", lab / "one.csv", "--map", lab / "map.toml", "-o", out, "--model", "default"]
+    assert surgisoft(*given) == 2
+    assert "chambers: 1, but the model has 3" in capsys.readouterr().err
+    assert not out.exists()
+    assert not out.with_suffix(".toml").exists()
+
+
 def test_files_become_runs_of_one_recording(lab, capsys):
     out = lab / "new" / "rec.parquet"
     raw = [lab / "one.csv", lab / "two.csv"]

@@ -108,6 +108,15 @@ def test_the_command_of_an_averaged_sample_is_its_last_one(tmp_path):
     np.testing.assert_allclose(read.t_s, [0.0, 0.15])
 
 
+def test_logs_of_one_name_are_two_recordings_that_nobody_can_tell_apart(tmp_path, capsys):
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+    logs = [str(_log(tmp_path / name / "r.log.jsonl")) for name in ("one", "two")]
+    assert run(["import", *logs, "-o", str(tmp_path / "new"), "--force"]) == 2
+    assert "2 files would become the recording 'r.log'" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
 SAMPLE = '{head}\n{"row":0,"run":RUN,"t_s":0,"p":[1],"k":[[0,0,0]]}\n{}\n'
 
 

@@ -75,8 +75,7 @@ def import_files(paths: Sequence[Path], spec: ImportMap, name: str | None) -> li
             replace(p, recording=_started_at(p.recording, spec, float(p.recording.t_s[0])))
             for p in parts
         ]
-        _check_names(named)
-        return [_finished(part, spec) for part in named]
+        return [_finished(part, spec) for part in _named_apart(named)]
     return [_finished(_as_runs(parts, spec, name), spec)]
 
 
@@ -99,9 +98,9 @@ def import_recordings(
     if map_file is not None:
         return import_files(paths, load_map(str(map_file)), name)
     if paths and all(path.suffix == LOG_SUFFIX for path in paths):
-        return [import_log(path, name or path.stem) for path in paths]
+        return _named_apart([import_log(path, name or path.stem) for path in paths])
     if paths and all(is_dataset(path) for path in paths):
-        return [import_lerobot(path, name or path.name) for path in paths]
+        return _named_apart([import_lerobot(path, name or path.name) for path in paths])
     first = f" {paths[0]}" if paths else ""
     raise InputError(
         "--map is missing: a map file states columns, units and frames; "
@@ -425,7 +424,8 @@ def _common_gravity(recordings: list[Recording]) -> np.ndarray | None:
     return mean / np.linalg.norm(mean)
 
 
-def _check_names(parts: list[Imported]) -> None:
+def _named_apart(parts: list[Imported]) -> list[Imported]:
+    """The recordings, whose names differ; InputError where two have one name."""
     names = [part.recording.name for part in parts]
     for name in names:
         if names.count(name) > 1:
@@ -433,6 +433,7 @@ def _check_names(parts: list[Imported]) -> None:
                 f"{names.count(name)} files would become the recording '{name}', expected names "
                 "that differ"
             )
+    return parts
 
 
 def _finished(part: Imported, spec: ImportMap) -> Imported:

@@ -11,8 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
-from surgisoft.measurement.recordings import AlarmInfo, Recording, check_writable, save_recording
+from surgisoft.measurement.recordings import (
+    AlarmInfo,
+    Recording,
+    after_alarm,
+    check_writable,
+    save_recording,
+)
 from surgisoft.measurement.recordings.log import LogHeader, RecordingLog, recording_log
+from surgisoft.measurement.recordings.sidecar import sidecar_of
 from surgisoft.rig.interface import Rig, Sample
 
 
@@ -22,8 +29,8 @@ class RunLog:
     def __init__(self, rig: Rig, path: str | Path | None, force: bool = False, note: str = ""):
         """path: the recording that the log becomes (.parquet or .csv); None: in memory only.
 
-        Raises InputError where the recording or the log of an interrupted one is there, unless
-        `force` is set.
+        Raises InputError where the recording, its part after an alarm or the log of an interrupted
+        one is there, unless `force` is set.
         """
         self.rig, self.path, self.force, self.note = rig, None, force, note
         self.samples: list[Sample] = []
@@ -34,6 +41,7 @@ class RunLog:
             return
         self.path = Path(path)
         check_writable(self.path, force)
+        check_writable(after_alarm(self.path), force)
         self.growing = self.path.with_name(f"{self.path.stem}.log.jsonl")
         gravity = None if rig.gravity is None else np.asarray(rig.gravity).tolist()
         header = LogHeader(
@@ -95,6 +103,13 @@ class RunLog:
             save_recording(found, self.path, self.force)
         self.discard()
         return found
+
+    def without_alarm(self) -> None:
+        """Remove what came after the alarm of an earlier run that this one has replaced."""
+        if self.path is not None and self.force:
+            after = after_alarm(self.path)
+            for place in (after, sidecar_of(after)):
+                place.unlink(missing_ok=True)
 
     def close(self) -> None:
         """Hand all rows to the disk."""

@@ -383,16 +383,17 @@ class _Session:
                 nullcontext() if clock.pace == "simulated" else _real_time_priority(),
             ):
                 try:
-                    drive()
-                except Finished:
-                    pass
-                except (KeyboardInterrupt, Terminated) as ended:
-                    self.interrupted, self.ended_by = True, ended
+                    try:
+                        drive()
+                    except Finished:
+                        pass
+                    except (KeyboardInterrupt, Terminated) as ended:
+                        self.interrupted, self.ended_by = True, ended
+                    self.watched.flush()
+                    self._late_detector(wait=True)
                 except InputError:
                     self._keep(log)
                     raise
-                self.watched.flush()
-                self._late_detector(wait=True)
             return self._result(log, clock)
 
     def _watch(
@@ -814,6 +815,8 @@ class _Session:
                 part = since(recording, alarms[0].since_s, after.stem)
                 save_recording(part, after, self.request.force)
                 written.append(after)
+            else:
+                log.without_alarm()
         return RunResult(
             self.request,
             recording,

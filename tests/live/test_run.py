@@ -265,6 +265,42 @@ def test_the_log_of_an_interrupted_run_is_not_overwritten(schedule, tmp_path):
     assert left.read_text() == "what is left of an earlier run"
 
 
+def test_what_came_after_an_earlier_alarm_is_not_in_the_way_at_the_end(schedule, tmp_path):
+    """Refused before the rig moves; with `force` it goes with the run that it belonged to."""
+    output, after = tmp_path / "run.parquet", tmp_path / "run-after.parquet"
+    for place in (after, after.with_suffix(".toml")):
+        place.write_text("of an earlier run")
+    rig = Real()
+    with pytest.raises(InputError, match=r"run-after\.parquet: exists already"):
+        run(schedule, rig, output=output, on_warning=pytest.fail)
+    assert (rig.reads, sorted(tmp_path.iterdir())) == (0, [after, after.with_suffix(".toml")])
+    run(schedule, output=output, minutes=0.05, force=True, **SIMULATED)
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["run.parquet", "run.toml"]
+
+
+def test_samples_are_kept_where_the_last_one_ends_the_run(schedule, tmp_path, monkeypatch):
+    """What is judged after the loop may refuse as well as what is judged in it."""
+    asked, flush = [], session.WatchedSimulation.flush
+
+    def stopped():
+        asked.append(0)
+        return len(asked) > 100
+
+    def refuse(watched):
+        flush(watched)
+        if len(asked) > 100:
+            raise InputError("it is the model of another arm")
+
+    monkeypatch.setattr(session.WatchedSimulation, "flush", refuse)
+    output, warnings = tmp_path / "run.parquet", []
+    given = {"output": output, "clock": "simulated", "on_warning": warnings.append}
+    with pytest.raises(InputError, match="the model of another arm"):
+        run(schedule, stopped=stopped, **given)
+    assert load_recording(output).samples > 50
+    assert str(output) in warnings[-1]
+    assert not output.with_name("run.log.jsonl").exists()
+
+
 def test_the_model_of_another_arm_is_refused(schedule, tmp_path):
     with pytest.raises(InputError, match="it is the model of another arm"):
         run(schedule, "virtual:seed=2", clock="simulated", on_warning=lambda text: None)

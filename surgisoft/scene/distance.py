@@ -459,7 +459,7 @@ def nearest_to_surface(line, turn, shift, bound, slack, tree, found, nodes, reac
         q = _moved(turn, shift, line[k])
         limit = best + slack
         d2 = segment_surface_d2(p, q, limit * limit, tree, nodes, reach, True)
-        distance[k] = math.sqrt(d2)
+        distance[k] = math.inf if d2 >= limit * limit else math.sqrt(d2)
         best, p = min(best, distance[k]), q
     found[0], found[1] = segments, -1
     for k in range(segments):

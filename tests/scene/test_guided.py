@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from surgisoft.scene import collision
 from surgisoft.scene.batched import BatchedScene
+from surgisoft.scene.bvh import STACK, build_tree
 from surgisoft.scene.camera import LIFT_MM, SHORT_MM, Camera, seen_from
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import CollisionChecker, ExactScene, GuidedChecker
@@ -73,6 +74,22 @@ def test_bodies_of_many_faces_are_given_to_fcl_as_a_whole(bodies, checkers, monk
     small = [len(body.mesh.faces) for body in bodies if len(body.mesh.faces) <= 100]
     assert asked == 2 * small
     assert 0 < len(small) < len(bodies)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.integers(1, 40), min_size=3, max_size=12))
+def test_the_segments_that_come_nearest_are_those_found(heights):
+    """Above a plate as wide as a table, a segment is as near as its lower end."""
+    mesh = box((2000.0, 2000.0, 10.0))
+    line = np.stack([10.0 * np.arange(len(heights)), 0.0 * np.array(heights), heights], axis=1)
+    line[:, 2] += 5.0
+    found, work = np.empty(2, np.int64), (np.empty(STACK, np.int64), np.empty(STACK))
+    guide = (1000.0, 1e-6, build_tree(mesh).arrays, found, *work)
+    least = collision.nearest_to_surface(line.astype(np.float32), np.eye(3), np.zeros(3), *guide)
+    lower = np.minimum(heights[1:], heights[:-1])
+    nearest = np.flatnonzero(lower == lower.min())
+    assert least == pytest.approx(lower.min(), abs=1e-5)
+    assert found.tolist() == [nearest[0], nearest[-1]]
 
 
 def test_the_search_leaves_little_to_whole_arms(bodies):

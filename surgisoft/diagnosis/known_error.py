@@ -29,6 +29,7 @@ from surgisoft.diagnosis.residuals import (
     motion_states,
 )
 from surgisoft.diagnosis.statistics import cross_validated_ridge
+from surgisoft.errors import InputError
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.history import pack
 from surgisoft.surrogate.training_residuals import TrainingResiduals
@@ -38,6 +39,8 @@ KNOWN_ROWS = 6000
 KNOWN_BLOCK_S = 15.0
 """Length of the blocks of time of BEFORE that are held out together, s: three times those of an
 identification, since slow memories connect neighbours."""
+ASKED_AT_ONCE = 200
+"""Rows whose neighbours are sought at once: each may have KNOWN_ROWS of them."""
 KNOWN_PENALTIES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 """Ridge penalties that are tried, as shares of the number of rows; the last one leaves nothing."""
 
@@ -90,6 +93,11 @@ class KnownRows:
 def rows_before(before: ResidualTable) -> KnownRows:
     """The rows of recordings from before a change."""
     rows = np.flatnonzero(np.isfinite(before.residual_mm).all(2).any(1))
+    if not len(rows):
+        raise InputError(
+            f"{' + '.join(before.names)}: every key point is missing in every row, expected "
+            "positions; give other recordings from before the change"
+        )
     rows = rows[:: max(1, -(-len(rows) // KNOWN_ROWS))]
     state = motion_states(before.history, half_range(before.spec))
     return KnownRows(
@@ -163,8 +171,12 @@ def _first_blocks(
     what is known of the motions of AFTER. Rows with the same actuation and the same past
     (`residuals.MOTION_ALIKE`) are held out together.
     """
-    near = cKDTree(state[rows]).query_ball_point(state[rows], MOTION_ALIKE, p=np.inf)
-    first = rows[[min(some) for some in near]]
+    points = state[rows]
+    tree = cKDTree(points)
+    # In parts: each of the rows at rest has all others for neighbours.
+    parts = np.array_split(points, -(-len(points) // ASKED_AT_ONCE))
+    near = (tree.query_ball_point(part, MOTION_ALIKE, p=np.inf) for part in parts)
+    first = rows[[min(some) for part in near for some in part]]
     part = run[first] * 1e6 + t_s[first] // KNOWN_BLOCK_S
     return np.unique(part, return_inverse=True)[1]
 

@@ -873,6 +873,15 @@ def test_what_has_changed_since_the_fit_is_printed(model, tmp_path, monkeypatch,
     assert (said["kind"], said["effects"], said["sentence"]) == ("identified", ["spring"], sentence)
 
 
+def test_before_without_any_key_point_is_refused(model):
+    after = made(smooth_walk(16), 0.0, rows=400)
+    nothing = replace(
+        after, name="morning", key_points_mm=np.full_like(after.key_points_mm, np.nan)
+    )
+    with pytest.raises(InputError, match="morning: every key point is missing in every row"):
+        diagnose(model, [after], before=[nothing], setup_tests=False, paired="never")
+
+
 def test_repeats_of_one_motion_teach_nothing_of_another(model):
     """What is wrong at each instant of a motion comes again with its repeats, and not elsewhere."""
     cycle, repeats = 600, 4

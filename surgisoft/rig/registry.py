@@ -40,6 +40,9 @@ Gravity = Annotated[
 HiddenEffects = Annotated[
     tuple[str, ...], "hidden effects, NAME or NAME:AMPLITUDE; @SECONDS behind it: begins later"
 ]
+LastingEffects = Annotated[
+    tuple[str, ...], "hidden effects, NAME or NAME:AMPLITUDE, from the start"
+]
 RobotSeed = Annotated[int, "seed of the robot"]
 NoiseSeed = Annotated[int, "seed of the noise of sensors and cameras"]
 RollDeg = Annotated[float, "rotation of the base about its axis [deg]"]
@@ -73,7 +76,7 @@ def virtual(
 def elastica(
     seed: RobotSeed = 0,
     noise_seed: NoiseSeed = 0,
-    hidden: HiddenEffects = (),
+    hidden: LastingEffects = (),
     gravity: Gravity | None = None,
     roll_deg: RollDeg = 0.0,
     payload_g: PayloadG = 0.0,

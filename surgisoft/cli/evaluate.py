@@ -42,7 +42,8 @@ def evaluate(
         typer.Argument(
             metavar="POLICY",
             help="scripted (inverse kinematics with the true state), random, or the folder "
-            "of a training run. Several policies are evaluated on the same episodes.",
+            "of a training run, or ring (the policies of the package). Several policies are "
+            "evaluated on the same episodes.",
         ),
     ],
     task: OfRunTask = None,

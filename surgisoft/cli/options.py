@@ -46,8 +46,8 @@ ModelError = Annotated[
     Option(
         "--model-error",
         metavar="MM",
-        help="Validated RMS error of a key point, mm, of a callable model or of a model given by "
-        "its predictions. Default: the error that the model states, else its error on --before.",
+        help="Validated RMS error of a key point, mm, of a model that is a callable or, where "
+        "these are taken, predictions. Default: the error that it states, else that on --before.",
     ),
 ]
 Recordings = Annotated[
@@ -60,8 +60,8 @@ Before = Annotated[
         metavar="REC...",
         help="Recordings from before a change. If they were made with the same actuation, the "
         "effects have to explain the difference between the measurements, in which the model's "
-        "error cancels. Otherwise the model's residuals before and after are compared, and effects "
-        "are fitted as without this option.",
+        "error cancels. Otherwise what the model got wrong on these recordings is learned and "
+        "subtracted; `amend` then fits effects as without this option.",
     ),
 ]
 Paired = Annotated[

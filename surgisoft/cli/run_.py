@@ -33,7 +33,8 @@ def run(
         str,
         typer.Argument(
             metavar="POLICY",
-            help="Folder of a training run, scripted or random (with --task); or without a policy "
+            help="Folder of a training run, ring (the policies of the package), scripted or random "
+            "(with --task); or without a policy "
             "SCHEDULE.csv or a continuous protocol ('surgisoft collect --list-protocols').",
         ),
     ],

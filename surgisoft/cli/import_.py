@@ -65,7 +65,6 @@ def import_(
     Reports what looks wrong: lengths, reversed key points, clocks that differ. With a model of the
     arm, frames, units, orders, chambers and dead channels are tested, too.
     """
-    from surgisoft.measurement.histories import check_fits
     from surgisoft.measurement.importing import import_recordings
     from surgisoft.measurement.recordings import (
         check_writable,
@@ -96,6 +95,8 @@ def import_(
         raise InputError(f"{output}: {len(parts)} recordings, expected a folder for them")
     targets = [output if to_file else output / f"{part.recording.name}.parquet" for part in parts]
     if arm:
+        from surgisoft.measurement.histories import check_fits
+
         check_fits(arm.spec, [part.recording for part in parts], sized=False)
     for target in targets if not dry_run else []:
         check_writable(target, force)

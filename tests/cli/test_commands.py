@@ -54,6 +54,11 @@ def test_fitted_arm_beats_pressure_alone(lab, capsys):
             run(["compare", str(lab / name), str(lab / "test.parquet"), "--json", str(file)]) == 0
         )
         errors[name] = json.loads(file.read_text())
+    effects = {
+        name: list(json.loads((lab / name / "config.json").read_text())["effects"])
+        for name in ("arm", "plain")
+    }
+    assert effects == {"arm": ["hysteresis"], "plain": []}
     assert errors["arm"]["rmse_mm"] < 0.7 * errors["plain"]["rmse_mm"]
     assert errors["arm"]["floor_mm"] < errors["arm"]["rmse_mm"]
     assert errors["arm"]["samples"] == 150

@@ -163,8 +163,16 @@ def collect(
         return
     recording = record_on(protocol, rig, output, force, preflight=arm, hidden=effects, **fields)
     save_recording(recording, output, force)
-    log_of(output).unlink(missing_ok=True)
+    drop_log(rig, output)
     print(written_line(output, recording, effects))
+
+
+def drop_log(rig: str, output: Path) -> None:
+    """Remove the log of a recording that is complete; a simulated rig has written none."""
+    from surgisoft.rig.registry import SIMULATED, parse_rig
+
+    if parse_rig(rig).name not in SIMULATED:
+        log_of(output).unlink(missing_ok=True)
 
 
 def log_of(output: Path) -> Path:

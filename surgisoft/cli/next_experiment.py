@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.collect import check_new_recording, log_of, record_on, written_line
+from surgisoft.cli.collect import check_new_recording, drop_log, record_on, written_line
 from surgisoft.cli.files import check_folder, check_free
 from surgisoft.cli.inputs import check_model, read_before, read_recordings, warn_all
 from surgisoft.cli.options import (
@@ -221,5 +221,5 @@ def _record(result, rig: str, schedule: Path, record: Path, force: bool) -> None
     from surgisoft.measurement.recordings import save_recording
 
     save_recording(recording, record, force)
-    log_of(record).unlink(missing_ok=True)
+    drop_log(rig, record)
     print(written_line(record, recording))

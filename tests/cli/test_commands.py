@@ -35,6 +35,15 @@ def lab(tmp_path_factory):
     return folder
 
 
+def test_a_simulated_recording_leaves_the_log_of_an_interrupted_one(tmp_path):
+    """It wrote none: the log is all that is left of a real recording."""
+    left = tmp_path / "bench.log.jsonl"
+    left.write_text("what was measured until then")
+    out = str(tmp_path / "bench.csv")
+    assert run(["collect", "validation", "--points", "10", "-o", out]) == 0
+    assert left.read_text() == "what was measured until then"
+
+
 def test_fitted_arm_beats_pressure_alone(lab, capsys):
     plain = str(lab / "plain")
     assert (

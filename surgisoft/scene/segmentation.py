@@ -166,8 +166,11 @@ def read_segmentation(
     notes = [f"{path.name}: {image.listed()}", _orientation(image)]
     given = set(masks)
     left_out = [key for key in image.volumes_ml if key not in given]
-    named = {str(value): name for name, (_, value) in image.segments.items()}
-    left_out = [key for key in left_out if named.get(key, key) not in given]
+    # A segment may be given by its name or, in the first layer, by its value.
+    values = {name: str(value) for name, (layer, value) in image.segments.items() if not layer}
+    names = {value: name for name, value in values.items()}
+    alias = names | values
+    left_out = [key for key in left_out if alias.get(key, key) not in given]
     if left_out:
         notes.append(f"{path.name}: left out: {', '.join(left_out)}; name them with --label")
     inner = [masks[label.key] for label in labels if label.role == "keep-out"]
@@ -272,6 +275,9 @@ def _read_nifti(path: Path) -> Image:
     to_ras = np.array(file.affine, dtype=float)
     to_ras[:3] *= MM_PER_UNIT.get(unit, 1.0)
     oriented = bool(file.header["sform_code"] > 0 or file.header["qform_code"] > 0)
+    if not oriented:  # without a form nibabel mirrors the first axis
+        spacing = np.abs(np.array(file.header.get_zooms()[:3], dtype=float))
+        to_ras = np.diag([*(MM_PER_UNIT.get(unit, 1.0) * spacing), 1.0])
     return Image(path, labels[None], to_ras, {}, oriented)
 
 

@@ -131,6 +131,18 @@ def test_the_order_of_voxels_does_not_matter(order, flips, read, tmp_path):
             )
 
 
+def test_an_image_without_orientation_is_not_mirrored(read, tmp_path):
+    """Its axes are taken as right, anterior, superior, as the note says, from the first voxel."""
+    file = tmp_path / "none.nii"
+    image = nibabel.Nifti1Image(patient(), None)
+    image.header.set_zooms(SPACING)
+    nibabel.save(image, file)
+    found = read_segmentation(file, LABELS)
+    assert any("right, anterior, superior" in note for note in found.notes)
+    place = np.array(LESION) - ORIGIN
+    np.testing.assert_allclose(found.lesion_mm.mean(axis=0), place, atol=0.3)
+
+
 def test_the_headers_unit_counts(read, tmp_path):
     matrix = to_ras()
     matrix[:3] /= 1000.0
@@ -207,6 +219,12 @@ def test_slicers_segments_have_names_and_may_overlap(tmp_path):
     read = read_segmentation(path, (parse_label("liver:organ"), parse_label("tumour:lesion")))
     np.testing.assert_allclose(read.lesion_mm.mean(axis=0), LESION, atol=0.3)
     assert [part.name for part in read.parts] == ["liver"]
+    assert not any("left out: " in note for note in read.notes)
+    by_value = read_segmentation(path, (parse_label("1:organ"), parse_label("tumour:lesion")))
+    assert not any("left out: " in note for note in by_value.notes)
+    (note,) = (text for text in read_segmentation(path, (parse_label("1:organ"),)).notes
+               if "left out: " in text)  # fmt: skip
+    assert "left out: tumour; name" in note
     with pytest.raises(InputError, match=r"no label 'kidney'; its labels are liver \(.*\), tumour"):
         read_segmentation(path, (parse_label("kidney:organ"),))
 

@@ -56,6 +56,11 @@ class PhasedTask:
         self.config: Any = getattr(base, "config", None)
         dt_s, limits, device = base.world.config.dt_s, spec.limits, base.world.device
         self.dt_s, self.steps = dt_s, round(limits.time_s / dt_s)
+        if self.steps < 1:
+            raise InputError(
+                f"limits.time_s is {limits.time_s:g} s, expected at least a step of {dt_s:g} s: "
+                "change time_s"
+            )
         self.clear_mm = max(limits.clearance_mm, supervision.clearance_limit_mm)
         self.lost_steps = round(limits.view_lost_s / dt_s)
         self.phases, self.conditions = spec.phases, spec.of.experiment.conditions

@@ -160,6 +160,11 @@ def rig_config(setting: Setting, place: Where, arms: Sequence[str]) -> RigConfig
                     f"unknown hidden effect '{name}'", f"one of {', '.join(sorted(hidden_of(rig)))}"
                 )
     seeds = [varied[name] for name in ROBOT_SEED if name in varied] or [setting.case.robot_seed]
+    for effect, amount in hidden.items():
+        if not 0.0 <= amount < math.inf:
+            raise (place / "cases").error(
+                f"strength of '{effect}' is {amount:g}", "a number from 0 on"
+            )
     pairs = tuple((name, strength) for name, strength in hidden.items() if strength > 0.0)
     return RigConfig(
         seed=int(seeds[0]), hidden=pairs, rigs=setting.case.rigs, preflight=setting.case.preflight

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -120,8 +121,9 @@ def with_policy(spec: Experiment, folder: str | Path) -> Experiment:
     if trained != spec.scenario:
         raise InputError(f"{folder}: was trained on {trained}; expected a run of {spec.scenario}")
     path = resolved(RunFolder(folder).path)
+    plain = re.sub(r"[^A-Za-z0-9_-]", "_", path.name)
     twins = tuple(
-        replace(case, name=f"{case.name}-{path.name}", policy=str(path))
+        replace(case, name=f"{case.name}-{plain}"[:64], policy=str(path))
         for case in spec.cases
         if case.policy == SCRIPTED
     )

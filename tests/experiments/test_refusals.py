@@ -69,6 +69,18 @@ def test_hidden_effects_and_robots_vary_on_the_rig(tmp_path):
     wrong = RIG + 'hidden = ["creep:much"]\n'
     with pytest.raises(InputError, match=r"got 'creep:much'; expected NAME or NAME:STRENGTH"):
         settings(spec_of(tmp_path, TINY + wrong))
+    for strength in ("-1", "nan"):
+        wrong = RIG + f'hidden = ["creep:{strength}"]\n'
+        with pytest.raises(InputError, match=f"strength of 'creep' is {strength}; expected a numb"):
+            settings(spec_of(tmp_path, TINY + wrong))
+
+
+def test_an_episode_has_a_step(tmp_path):
+    spec = spec_of(tmp_path)
+    short = replace(spec, limits=replace(spec.limits, time_s=0.04))
+    (setting,) = settings(short)
+    with pytest.raises(InputError, match=r"time_s is 0\.04 s, expected at least a step of 0\.1 s"):
+        build_task(short, setting)
 
 
 def test_a_lesion_of_an_experiment_lies_on_the_organ(tmp_path):
@@ -99,6 +111,11 @@ def test_folders_and_options_that_do_not_fit(tmp_path):
     twice = with_policy(spec, run)
     assert [case.name for case in twice.cases] == ["simulation", f"simulation-{run.name}"]
     assert twice.cases[1].policy == str(run.resolve())
+    odd = tmp_path / f"my run.v2 {'x' * 64}"
+    shutil.copytree(run, odd)
+    save_experiment(with_policy(spec, odd), tmp_path / "odd.toml")
+    named = load_experiment(tmp_path / "odd.toml").cases[1].name
+    assert named == f"simulation-my_run_v2_{'x' * 64}"[:64]
     out = tmp_path / "out"
     for call, message in (
         (lambda: experiments_of(tmp_path / "empty"), "no experiment (*.toml) there"),

@@ -234,6 +234,10 @@ class Plan:
     def __post_init__(self):
         if self.steps is None and self.minutes is None:
             raise InputError("train: neither steps nor minutes are given; expected one of them")
+        if not 0 <= self.seed < 2**63:
+            raise InputError(
+                f"train: seed is {self.seed}, expected a whole number from 0 to 2^63 - 1"
+            )
         for name in ("steps", "minutes", "target_error"):
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0):

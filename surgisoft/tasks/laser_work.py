@@ -570,6 +570,11 @@ class RingTask(OneLaserTask[Cut]):
         """The arguments are those of `LaserTask`."""
         super().__init__(config, device, **others)
         self.round = round(config.cut_s / self.dt_s)
+        if self.round < 1:
+            raise InputError(
+                f"{self.name}: cut_s is {config.cut_s:g} s, expected at least a step, "
+                f"{self.dt_s:g} s"
+            )
 
     def target_mm(self, state: TaskState[Cut], ahead: int = 0) -> Tensor:
         """(B, 3) mm: the reference point on the ring `ahead` steps further on."""

@@ -206,6 +206,10 @@ class TwoLaserRing(LaserTask[SharedCut]):
                 f"{' and '.join(LASERS)}, and {ENDOSCOPE}"
             )
         self.round = round(c.cut_s / self.dt_s)
+        if self.round < 1:
+            raise InputError(
+                f"{self.name}: cut_s is {c.cut_s:g} s, expected at least a step, {self.dt_s:g} s"
+            )
 
     def goal(self, stream: Stream) -> tuple[Stream, SharedCut]:
         """Draw start and direction of the cut for each random number stream."""

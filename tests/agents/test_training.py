@@ -33,6 +33,7 @@ from surgisoft.agents.shared_ppo import SharedPPO
 from surgisoft.agents.training import Clock, Training, resume, train_new
 from surgisoft.agents.training_request import TrainingRequest
 from surgisoft.agents.vec_env import STATE, JointEnv
+from surgisoft.cli import run as command
 from surgisoft.errors import InputError
 from surgisoft.tasks.registry import config_of, make_task, with_fields
 
@@ -641,6 +642,16 @@ def test_the_seed_that_selects_judges_nothing():
     }
     assert used == {0}
     assert SEED > 10_000
+
+
+@pytest.mark.parametrize("seed", [-1, 2**63])
+def test_a_seed_that_no_generator_takes_is_refused_before_the_folder_is_made(
+    seed, tmp_path, capsys
+):
+    given = ["task=track_circle", f"seed={seed}", "steps=1000", "envs=64"]
+    assert command(["train", *given, "-o", str(tmp_path / "run")]) == 2
+    assert "seed" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_weights_of_a_new_training_follow_from_its_seed():

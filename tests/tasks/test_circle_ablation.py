@@ -139,6 +139,8 @@ def test_a_collision_ends_the_episode_and_is_no_success(quick):
 def test_bad_config_is_one_line():
     with pytest.raises(InputError, match="cut_s is nan"):
         CircleAblationConfig(cut_s=math.nan)
+    with pytest.raises(InputError, match=r"cut_s is 0\.01 s, expected at least a step, 0\.1 s"):
+        CircleAblation(CircleAblationConfig(cut_s=0.01))
     with pytest.raises(InputError, match="there is no such scene"):
         CircleAblation(CircleAblationConfig(scene="no/such/scene"))
 

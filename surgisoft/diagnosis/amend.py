@@ -335,6 +335,7 @@ def amend(
     tell("predicting")
     sealed = Sealed(recordings)
     plain = table = residual_table(model, sealed.training)
+    sealed.check(table)
     both, earlier = None, []
     if before is not None:
         earlier = load_recordings(before)

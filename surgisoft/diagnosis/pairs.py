@@ -894,7 +894,7 @@ def free_motion(
     for values in _stretches(after, fields, step, length):
         found = np.square(np.abs(_spectrum(values))).reshape(-1, 5, points, 3).sum(3)
         power, count = found if power is None else power + found, count + 1
-    if power is None:
+    if power is None or length < 2 * LEAST_BINS:
         return np.zeros(points)
     total = power / count
     frequency = np.fft.rfftfreq(length, step)
@@ -912,7 +912,7 @@ def _stretch(table: ResidualTable, longest_s: float) -> tuple[float, int]:
     """(time between two samples, s; samples of a stretch, a power of two)."""
     steps = [np.diff(signal.t_s) for signal in run_signals(table, False) if signal.timed]
     step = float(np.median(np.concatenate(steps))) if steps else 1.0
-    return step, int(2 ** np.floor(np.log2(max(2.0, longest_s / step))))
+    return step, int(2 ** np.floor(np.log2(max(4.0, longest_s / step))))
 
 
 def _stretches(

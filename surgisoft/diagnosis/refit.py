@@ -419,7 +419,7 @@ class Split:
             ~torch.from_numpy(kept)[:, None, None], torch.nan
         )
         by_run = _parts_of_runs(problem, config.seeds)
-        part = problem.motion // TOGETHER % config.seeds
+        part = _parts_of_blocks(problem.motion, config.seeds)
         run_of_block = _run_of_block(problem)
         enough = by_run is not None and int(run_of_block.max()) + 1 >= least_units()
         return cls(
@@ -474,6 +474,15 @@ def _run_of_block(problem: Problem) -> np.ndarray:
     answer = np.zeros(int(problem.block.max()) + 1, int)
     answer[problem.block] = np.unique(run, return_inverse=True)[1]
     return answer
+
+
+def _parts_of_blocks(motion: np.ndarray, parts: int) -> np.ndarray:
+    """(B,) part of each block, none of them empty: neighbouring motions together where there are
+    enough, blocks where there are fewer motions than parts."""
+    count = int(motion.max()) + 1
+    if count < parts:
+        return np.arange(len(motion)) // TOGETHER % parts
+    return motion // (TOGETHER if count > TOGETHER * (parts - 1) else 1) % parts
 
 
 def _parts_of_runs(problem: Problem, parts: int) -> np.ndarray | None:

@@ -426,6 +426,21 @@ class Sealed:
         ]
         self._key_points_mm: list[np.ndarray] | None = [r.key_points_mm for r in recordings]
 
+    def check(self, table: ResidualTable) -> None:
+        """Raise InputError where the held-out rows are too few for the final check.
+
+        Nothing but which of their key points are missing is looked at.
+        """
+        assert self._key_points_mm is not None
+        there = np.isfinite(np.concatenate(self._key_points_mm)).all(2).any(1) & table.held_out
+        try:
+            blocks(table.history, there)
+        except InputError as error:
+            raise InputError(
+                f"the held-out part, the last quarter of each recording, has {there.sum()} rows "
+                f"with key points, too few to validate an amendment on them: {error}"
+            ) from None
+
     def opened(self, table: ResidualTable) -> ResidualTable:
         """The table of the training rows with the held-out rows in it, for `final_check`.
 

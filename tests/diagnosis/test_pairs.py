@@ -873,6 +873,21 @@ def test_what_has_changed_since_the_fit_is_printed(model, tmp_path, monkeypatch,
     assert (said["kind"], said["effects"], said["sentence"]) == ("identified", ["spring"], sentence)
 
 
+def test_rows_seconds_apart_have_no_spectrum_and_are_compared_all_the_same(model):
+    """Of 10 s there are five rows: too few for a band of frequencies."""
+    slow = smooth_walk(3)(PERIOD_S * np.arange(ROWS))[::6]
+    t_s = 2.0 * np.arange(len(slow))
+    rest = unlearned(slow)
+    before, after = (
+        replace(recording(rest + shift, slow, seed=seed), t_s=t_s)
+        for seed, shift in ((1, 0.0), (2, 0.5))
+    )
+    both = paired(model, after, before)
+    assert both.used
+    assert np.isfinite(both.change.change_mm)
+    assert both.training().rmse_mm > 0.0
+
+
 def test_before_without_any_key_point_is_refused(model):
     after = made(smooth_walk(16), 0.0, rows=400)
     nothing = replace(

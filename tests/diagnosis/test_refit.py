@@ -293,6 +293,17 @@ def test_an_interval_and_a_spread_come_from_blocks_and_from_seeds(problem, monke
     assert 1.0 < low < row.difference_mm < high < 1.5
 
 
+@pytest.mark.parametrize("motions", [1, 2, 3, 4, 7, 20])
+def test_no_part_is_left_without_blocks(problem, motions):
+    """Blocks of few different motions; with enough of them neighbouring motions stay together."""
+    config = replace(SHORT, seeds=3)
+    few = replace(problem, motion=np.sort(np.arange(20) % motions))
+    part = Split.of(few, config).part
+    assert set(part.tolist()) == {0, 1, 2}
+    if motions >= 3:
+        assert all(len(set(part[few.motion == each])) == 1 for each in range(motions))
+
+
 HALF = np.arange(20) % 2 == 0
 """Every other one of 20 blocks."""
 FEW = np.isin(np.arange(20), (3, 8, 13))

@@ -229,6 +229,9 @@ def samples_of(
     samples = []
     for rows in sizes:
         step = 1 if model.remembers else max(1, round(len(measured) / rows))
+        # Cameras may be slower than the log: thinned rows must not all fall between their images.
+        while step > 1 and _kept(seen, ends, step).mean() < LEAST_SEEN * seen.mean():
+            step -= 1
         block = blocks(whole, seen, step, least_blocks=1)
         thinned = replace(
             whole,
@@ -252,6 +255,15 @@ def samples_of(
             )
         )
     return tuple(samples)
+
+
+LEAST_SEEN = 0.5
+"""Least share of thinned rows with key points, as a share of that of all rows."""
+
+
+def _kept(rows: np.ndarray, ends: np.ndarray, step: int) -> np.ndarray:
+    """(S,) values of rows (N,) that thinning every run leaves."""
+    return np.concatenate([part[::step] for part in np.split(rows, ends)])
 
 
 def interpolated(at: np.ndarray, times: np.ndarray, points: np.ndarray) -> np.ndarray:

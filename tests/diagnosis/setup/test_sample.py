@@ -1,5 +1,7 @@
 """Predictions for single rows of a sample, against those of the model for every row."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -46,3 +48,13 @@ def test_the_network_computes_each_row_once():
     assert given == [3, 1]
     assert np.array_equal(second[[0, 2]], first[[2, 0]])
     assert np.abs(second[1] - found.whole[7]).max() < 1e-4
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_cameras_slower_than_the_log_are_seen_by_the_coarse_sample(first):
+    """Key points in every second row: of every fourth row none has one, or all have."""
+    recording = measured(ROWS)
+    points = np.full_like(recording.key_points_mm, np.nan)
+    points[first::2] = recording.key_points_mm[first::2]
+    found = sample_of(default_arm(), [replace(recording, key_points_mm=points)], ROWS // 4)
+    assert (found.block >= 0).mean() > 0.25

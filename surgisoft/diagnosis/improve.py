@@ -281,7 +281,6 @@ def improve(
     known, sealed = model.training_residuals, Sealed(recordings)
     recordings = sealed.training
     table = residual_table(model, recordings)
-    sealed.check(table)
     problem = table.training()
     both, earlier = None, []
     if before is not None:

@@ -191,7 +191,7 @@ class Follow:
         self.dt_s = world.config.dt_s
         self.approach = round(config.approach_s / self.dt_s)
         self.loop = round(config.loop_s / self.dt_s)
-        if self.loop < 1:
+        if self.loop < 1 <= self.approach:
             raise InputError(
                 f"{name}: loop_s is {config.loop_s:g} s, expected at least a step, {self.dt_s:g} s"
             )

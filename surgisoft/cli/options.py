@@ -46,8 +46,8 @@ ModelError = Annotated[
     Option(
         "--model-error",
         metavar="MM",
-        help="Validated RMS error of a key point, mm, of a model that is a callable or, where "
-        "these are taken, predictions. Default: the error that it states, else that on --before.",
+        help="Validated RMS error of a key point, mm, of a callable model or of predictions. "
+        "Default: the error that the callable states, else its error on --before.",
     ),
 ]
 Recordings = Annotated[

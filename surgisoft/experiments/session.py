@@ -28,7 +28,7 @@ from surgisoft.replay.episode_view import write_replay
 from surgisoft.report import write_page
 from surgisoft.rig.registry import SIMULATED, check_rig, parse_rig
 from surgisoft.scene.spec import FILE as SCENE_FILE
-from surgisoft.scene.spec import PHANTOM, packaged_scene
+from surgisoft.scene.spec import MOST_LETTERS, PHANTOM, packaged_scene
 from surgisoft.tasks.base import Task
 
 PACKAGED = PHANTOM / "experiments"
@@ -123,7 +123,7 @@ def with_policy(spec: Experiment, folder: str | Path) -> Experiment:
     path = resolved(RunFolder(folder).path)
     plain = re.sub(r"[^A-Za-z0-9_-]", "_", path.name)
     twins = tuple(
-        replace(case, name=f"{case.name}-{plain}"[:64], policy=str(path))
+        replace(case, name=f"{case.name}-{plain}"[:MOST_LETTERS], policy=str(path))
         for case in spec.cases
         if case.policy == SCRIPTED
     )

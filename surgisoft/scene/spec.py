@@ -84,11 +84,15 @@ Range = Annotated[
     tuple[Distance, Distance],
     Rule("2 numbers [nearest, farthest] in mm, rising from 0", lambda r: 0.0 <= r[0] < r[1]),
 ]
+MOST_LETTERS = 64
+"""Most characters of a name (a count)."""
 Name = Annotated[
     str,
     Rule(
-        "a name of letters, digits, '_' and '-' (at most 64)",
-        lambda text: re.fullmatch(r"[A-Za-z0-9_-]{1,64}", text) is not None,
+        f"a name of letters, digits, '_' and '-' (at most {MOST_LETTERS})",
+        lambda text: (
+            re.fullmatch(r"[A-Za-z0-9_-]+", text) is not None and len(text) <= MOST_LETTERS
+        ),
     ),
 ]
 _NAME_OR_EMPTY = Rule(

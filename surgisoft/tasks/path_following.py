@@ -191,11 +191,11 @@ class Follow:
         self.dt_s = world.config.dt_s
         self.approach = round(config.approach_s / self.dt_s)
         self.loop = round(config.loop_s / self.dt_s)
-        if self.loop < 1 <= self.approach:
+        self.steps = self.approach + self.loop * config.loops
+        if self.steps and not self.loop:  # the approach alone
             raise InputError(
                 f"{name}: loop_s is {config.loop_s:g} s, expected at least a step, {self.dt_s:g} s"
             )
-        self.steps = self.approach + self.loop * config.loops
         self.weights = {"arm": config.weights}
         self._directions = directions
         self._rest = self.arm.model.rest_mm.to(centre_mm)

@@ -16,6 +16,7 @@ from surgisoft.diagnosis.amend import Amendment, Fall, amend, fall_of, track_of
 from surgisoft.diagnosis.compare import compare
 from surgisoft.diagnosis.estimation.network import Retuned, best_layer, retune
 from surgisoft.diagnosis.residuals import held_out_rows, problem_of, residual_table
+from surgisoft.errors import InputError
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import Recording, load_recording, save_recording
@@ -107,6 +108,18 @@ def test_the_locked_rows_take_no_part():
     one, other = (amend(bare_arm(), [each], ["gain_mismatch"]) for each in (recording, wild))
     assert one.parameters == other.parameters
     assert other.held_out.after > one.held_out.after + 5
+
+
+def test_a_held_out_part_without_key_points_is_refused_before_any_fit(monkeypatch):
+    rig = VirtualRig(0)
+    made = rig.record(make_protocol("mixed", rig.limits, 400))[0]
+    points = made.key_points_mm.copy()
+    points[280:] = np.nan
+    monkeypatch.setattr(
+        "surgisoft.diagnosis.amend.fit_effects", lambda *_, **__: pytest.fail("fitted")
+    )
+    with pytest.raises(InputError, match="the held-out part, the last quarter .* has 0 rows with"):
+        amend("default", [replace(made, key_points_mm=points)], "creep", refit="never")
 
 
 def test_an_amended_model_is_a_model(lab, capsys):

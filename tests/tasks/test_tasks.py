@@ -608,6 +608,7 @@ def test_an_episode_without_end_is_one_line(change):
     ("change", "message"),
     [
         ({"dt_s": 1_000_000.0}, "an episode of no step; expected longer times or a shorter"),
+        ({"loop_s": 0.01}, "loop_s is 0.01 s, expected at least a step, 0.1 s"),
         ({"samples": 10**9}, "world.samples is 1000000000, expected at most 1,000"),
         ({"history": 1001}, "world.randomisation.history is 1001"),
         ({"preview": 10**9}, "preview is 1000000000"),

@@ -18,6 +18,9 @@ from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel
 
+LEAST_SEEN = 0.5
+"""Least share of thinned rows with key points, as a share of that of all rows."""
+
 
 @dataclass(frozen=True)
 class Arrangement:
@@ -255,10 +258,6 @@ def samples_of(
             )
         )
     return tuple(samples)
-
-
-LEAST_SEEN = 0.5
-"""Least share of thinned rows with key points, as a share of that of all rows."""
 
 
 def _kept(rows: np.ndarray, ends: np.ndarray, step: int) -> np.ndarray:

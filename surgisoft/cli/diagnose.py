@@ -232,6 +232,8 @@ def _show_setup(setup) -> None:
 
 def _show(found) -> None:
     """Print the verdict, the ranking and the proposed experiment."""
+    from surgisoft.diagnosis.residuals import floor_in_words
+
     verdict, error = found.verdict, found.error_mm
     print(f"{verdict.kind}: {verdict.sentence}")
     for name, words in found.in_words:
@@ -243,7 +245,7 @@ def _show(found) -> None:
         print(f"{found.seconds:.1f} s")
         return
     print(
-        f"error {error.before:.4f} mm, floor {error.floor:.4f} mm, "
+        f"error {error.before:.4f} mm, floor {floor_in_words(error.floor, '.4f')}, "
         f"best achievable {error.best_achievable:.4f} mm (on {found.left_out})"
     )
     for check in found.checks:

@@ -148,6 +148,8 @@ def improve(
 
 def _show(result) -> None:
     """Print each round, then the parameters and the errors on the held-out part."""
+    from surgisoft.diagnosis.residuals import floor_in_words
+
     for number, done in enumerate(result.rounds, 1):
         what = f"+ {done.step}" if done.step else "no further effect"
         what = "interrupted" if done.verdict == "interrupted" else what
@@ -168,4 +170,4 @@ def _show(result) -> None:
         print(f"{'before':{width}s} {fall.before:8.4f} mm on {part}")
         for name, error in result.steps:
             print(f"{'+ ' + name:{width}s} {error:8.4f} mm")
-        print(f"{'floor':{width}s} {fall.floor:8.4f} mm")
+        print(f"{'floor':{width}s} {floor_in_words(fall.floor, '8.4f')}")

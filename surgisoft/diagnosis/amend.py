@@ -24,7 +24,7 @@ from surgisoft.diagnosis.other_models import name_of, open_model, refuse_predict
 from surgisoft.diagnosis.pairs import Change, Paired, before_and_after
 from surgisoft.diagnosis.refit import Refit, apart_mm, can_hide, fit_together, refit_reason
 from surgisoft.diagnosis.refit import refit as refit_effects
-from surgisoft.diagnosis.residuals import Problem, Sealed, residual_table
+from surgisoft.diagnosis.residuals import Problem, Sealed, floor_in_words, residual_table
 from surgisoft.diagnosis.statistics import block_interval, block_sums
 from surgisoft.errors import InputError
 from surgisoft.files import with_former_keys
@@ -127,7 +127,7 @@ class Fall:
         return (
             f"{self.before:.3f} to {self.after:.3f} mm {where} "
             f"(reduction {self.fall:.3f} mm, 95 % {low:.3f} to {high:.3f}; "
-            f"floor {self.floor:.3f} mm)"
+            f"floor {floor_in_words(self.floor, '.3f')})"
         )
 
     def to_json(self) -> dict:

@@ -99,10 +99,15 @@ def gap_hints(recordings: Sequence[Recording]) -> tuple[str, ...]:
 def data_quality_warnings(problem: Problem) -> list[str]:
     """Warnings about the recordings of an identification problem, one sentence each."""
     warnings, source = [], problem.table.floor.source
-    if source in (SOURCE_OF_SMOOTH, "unknown"):
+    if source == SOURCE_OF_SMOOTH:
         warnings.append(
             "the measurement noise is not stated and no holds show it: it was estimated from "
             "second differences in time; state noise_mm in the sidecar for a better noise floor"
+        )
+    elif source == "unknown":
+        warnings.append(
+            "the measurement noise is not stated and nothing in the recordings shows it: the noise "
+            "floor is not known; state noise_mm in the sidecar"
         )
     blocks, motions = len(problem.motion), int(problem.motion.max()) + 1
     if 2 * motions <= blocks:

@@ -67,7 +67,13 @@ from surgisoft.diagnosis.other_models import open_model
 from surgisoft.diagnosis.pairs import BeforeAfter, Change, ChangeTrack, Paired, before_and_after
 from surgisoft.diagnosis.refit import LINE_OR_WALL, Refit, beside, can_hide, refit_reason
 from surgisoft.diagnosis.refit import refit as fit_candidates_together
-from surgisoft.diagnosis.residuals import Problem, ResidualTable, Sealed, residual_table
+from surgisoft.diagnosis.residuals import (
+    Problem,
+    ResidualTable,
+    Sealed,
+    floor_in_words,
+    residual_table,
+)
 from surgisoft.diagnosis.selection import (
     Findings,
     Score,
@@ -199,6 +205,11 @@ class ErrorLevels:
     discrepancy_alone: float | None = None
     """Error that the model discrepancy alone, without an effect, leaves on held-out blocks: what
     the error with each effect is compared with. None where the set-up is at fault."""
+
+    @property
+    def in_words(self) -> str:
+        """The error and the noise floor."""
+        return f"error {self.before:.3g} mm, floor {floor_in_words(self.floor, '.3g')}"
 
     @property
     def size(self) -> str:
@@ -587,9 +598,9 @@ def lacking_before(both: BeforeAfter, report: Progress) -> tuple[str, ...]:
     command = "surgisoft improve --refit always" if together else "surgisoft improve"
     return (
         f"the model already lacks {named} on the recordings from before the change (error "
-        f"{problem.rmse_mm:.3g} mm, floor {problem.floor_mm:.3g} mm), so the parameters of what "
-        f"has changed may be off by more than their intervals say: first run '{command}' on the "
-        f"model and {both.names}, then amend the model that it writes",
+        f"{problem.rmse_mm:.3g} mm, floor {floor_in_words(problem.floor_mm, '.3g')}), so the "
+        "parameters of what has changed may be off by more than their intervals say: first run "
+        f"'{command}' on the model and {both.names}, then amend the model that it writes",
     )
 
 
@@ -628,7 +639,7 @@ def with_refit(result: Diagnosis, joint: Refit, problem: Problem) -> Diagnosis:
     A winner is named, alone or with what competes with it. Without one, effects that the residuals
     name are not named any more if all of them were tried: the network alone does as well.
     """
-    error = f"error {result.error_mm.before:.3g} mm, floor {result.error_mm.floor:.3g} mm"
+    error = result.error_mm.in_words
     verdict, ranking, checks = result.verdict, result.ranking, result.checks
     plan, competing = result.next_experiment, result.ambiguous_with
     evidence, chances = result.statistics, result.probabilities
@@ -1024,7 +1035,7 @@ def sentence_of(
     the actuation alone explains most of what can be explained; near: the effect that comes nearest
     to an unknown one."""
     kind, effects, sure = decision.kind, decision.effects, decision.confidence
-    error = f"error {levels.before:.3g} mm, floor {levels.floor:.3g} mm"
+    error = levels.in_words
     if kind == "identified":
         return (
             f"{effects[0]} is missing (confidence {sure:.2f}): with it {reached[0]:.3g} mm remain "

@@ -78,6 +78,12 @@ class Floor:
 UNKNOWN = Floor(None, "unknown")
 
 
+def floor_in_words(floor_mm: float, digits: str) -> str:
+    """A noise floor [mm] in words, its number in the format `digits`; `not known` for the least
+    noise, which stands for noise that nothing shows."""
+    return f"{floor_mm:{digits}} mm" if floor_mm > LEAST_NOISE_MM else "not known"
+
+
 def noise_of(recordings: list[Recording]) -> tuple[np.ndarray, str]:
     """(n,) RMS noise of each key point's distance, mm, and where it is known from.
 
@@ -89,8 +95,20 @@ def noise_of(recordings: list[Recording]) -> tuple[np.ndarray, str]:
     for floor in (_stated_floor(recordings), hold_floor(recordings)):
         if floor.rmse_mm is not None:
             return np.full(count, max(floor.rmse_mm, LEAST_NOISE_MM)), floor.source
-    number = [np.cumsum(np.diff(r.run, prepend=r.run[:1]) != 0) for r in recordings]
+    number = [
+        np.cumsum(np.diff(r.run, prepend=r.run[:1]) != 0)
+        if r.kind == "continuous"
+        else np.arange(r.samples)
+        for r in recordings
+    ]
     return _differences_noise([r.key_points_mm for r in recordings], number)
+
+
+LEAST_DIFFERENCES = 30
+"""Least number of second differences of a coordinate at the lag, in rows, that noise is taken
+from. Their median is then within some 20 % of its limit."""
+MOST_LAG = 100
+"""Largest such lag, rows: a camera may be that many times slower than the log."""
 
 
 def _differences_noise(
@@ -98,23 +116,43 @@ def _differences_noise(
 ) -> tuple[np.ndarray, str]:
     """(n,) RMS noise of each key point's distance, mm, from second differences, and its source.
 
-    points_mm: (T, n, 3) of each recording, NaN where missing; run: (T,) run of each of its rows.
-    The spread is the median of absolute values, scaled to the standard deviation of a normal
-    distribution. One coordinate follows another, because the differences of all of them together
-    take several times the memory of the recordings.
+    points_mm: (T, n, 3) of each recording, NaN where missing; run: (T,) run of each of its rows, a
+    number of its own for each row that is not one of a motion. The lag of the differences is the
+    least at which there are enough of them. Where the motion makes up more than half of their
+    variance, it is taken out of it: at twice the lag that of a smooth motion is 16 times as large,
+    that of noise the same (Richardson, 1911). The spread is the median of absolute values, scaled
+    to the standard deviation of a normal distribution. One coordinate follows another, because the
+    differences of all of them together take several times the memory of the recordings.
     """
-    inside = [number[2:] == number[:-2] for number in run]
-    spread = np.zeros(points_mm[0].shape[1:])
-    for place in np.ndindex(*spread.shape):
-        second = np.concatenate(
-            [np.diff(p[:, *place], 2)[rows] for p, rows in zip(points_mm, inside, strict=True)]
-        )
-        second = second[~np.isnan(second)]
-        if len(second):
-            spread[place] = 1.4826 * np.median(np.abs(second)) / np.sqrt(6.0)
-    noise = np.sqrt((spread**2).sum(1))
+    variance = np.zeros((2, *points_mm[0].shape[1:]))
+    for place in np.ndindex(*variance.shape[1:]):
+        columns = [points[:, *place] for points in points_mm]
+        if all(np.isnan(column).all() for column in columns):
+            continue
+        lags = range(1, min(MOST_LAG, max(len(column) for column in columns) // 2) + 1)
+        lag = next((k for k in lags if len(_differences(columns, run, k)) >= LEAST_DIFFERENCES), 1)
+        for number, times in enumerate((lag, 2 * lag)):
+            second = _differences(columns, run, times)
+            if len(second):
+                variance[number, *place] = (1.4826 * np.median(np.abs(second))) ** 2 / 6.0
+    once, twice = variance.sum(2)
+    still = np.maximum(16.0 * once - twice, 0.0) / 15.0
+    noise = np.sqrt(np.where(still < once / 2, still, once))
     source = "second differences" if noise.any() else "unknown"
     return np.maximum(noise, LEAST_NOISE_MM), source
+
+
+def _differences(columns: Sequence[np.ndarray], run: Sequence[np.ndarray], lag: int) -> np.ndarray:
+    """Second differences of a coordinate (T,) at a lag, rows, within runs and without gaps."""
+    parts = [
+        (column[2 * lag :] - 2.0 * column[lag:-lag] + column[: -2 * lag])[
+            number[2 * lag :] == number[: -2 * lag]
+        ]
+        for column, number in zip(columns, run, strict=True)
+        if len(column) > 2 * lag
+    ]
+    second = np.concatenate([*parts, np.zeros(0)])
+    return second[~np.isnan(second)]
 
 
 def _floor_of(noise_mm: np.ndarray, source: str) -> Floor:
@@ -264,7 +302,8 @@ class ResidualTable:
         noise, floor = self.noise_mm, self.floor
         if floor.source == "second differences":
             training = np.where(self.held_out[:, None, None], np.nan, self.measured_mm)
-            noise, source = _differences_noise([training], [self.run])
+            run = np.where(self.timed, self.run, -1 - np.arange(len(self.run)))
+            noise, source = _differences_noise([training], [run])
             floor = _floor_of(noise, source)
         shown = self.held_out if part == "held_out" else ~self.held_out
         if np.isnan(self.measured_mm[~shown]).all():

@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from surgisoft.diagnosis.data_quality import data_quality_warnings
 from surgisoft.diagnosis.residuals import (
+    floor_in_words,
     held_out_rows,
     noise_of,
     problem_of,
@@ -129,3 +131,46 @@ def test_second_differences_find_the_noise_of_a_smooth_motion():
     floor = residual_table(still_model(), [made]).floor
     assert floor.source == "second differences"
     assert floor.rmse_mm == pytest.approx(FLOOR, rel=0.05)
+
+
+def test_settled_samples_have_no_second_differences():
+    """The motion from one steady-state sample to the next is no noise."""
+    made = recording(0.3 * CYCLE[:, 0], CYCLE, noise_mm=None, kind="settled")
+    table = residual_table(still_model(), [made])
+    for floor in (table.floor, table.only("training").floor):
+        assert (floor.source, floor.rmse_mm) == ("unknown", None)
+    said = [each for each in data_quality_warnings(table.training()) if "noise" in each]
+    assert len(said) == 1
+    assert "the noise floor is not known; state noise_mm" in said[0]
+
+
+@pytest.mark.parametrize("every", [2, 7])
+def test_cameras_slower_than_the_log_show_their_noise(every):
+    ramp = 5 + 5 * np.sin(np.arange(4500) / 300)[:, None] * [1.0, 0.5]
+    made = recording(0.3 * ramp[:, 0], ramp, noise_mm=None)
+    points = np.where((np.arange(4500) % every == 0)[:, None, None], made.key_points_mm, np.nan)
+    table = residual_table(still_model(), [replace(made, key_points_mm=points)])
+    assert table.floor.source == "second differences"
+    assert table.floor.rmse_mm == pytest.approx(FLOOR, rel=0.1)
+
+
+@pytest.mark.parametrize("amplitude_mm", [0.0, 4.0, 10.0])
+def test_a_motion_of_few_rows_is_not_taken_for_noise(amplitude_mm):
+    """20 rows in a period: at 10 mm the motion's second differences are six times the noise's."""
+    wave = np.sin(2 * np.pi * np.arange(3000) / 20)
+    made = recording(amplitude_mm * wave, 5 + wave[:, None] * [1.0, 0.5], noise_mm=None)
+    noise, source = noise_of([made])
+    assert source == "second differences"
+    assert noise[-1] == pytest.approx(FLOOR, rel=0.4)
+
+
+def test_a_motion_without_noise_has_no_floor():
+    """Every second difference of a parabola is the same, and four times as large at twice the lag:
+    nothing is left of it."""
+    made = recording(np.zeros(600), walk(600), noise_mm=None)
+    parabola = np.square(np.arange(600) / 8.0)  # exact in binary
+    points = np.broadcast_to(parabola[:, None, None], made.key_points_mm.shape)
+    noise, source = noise_of([replace(made, key_points_mm=points)])
+    assert source == "unknown"
+    assert floor_in_words(noise[0], ".3f") == "not known"
+    assert floor_in_words(0.25, ".3f") == "0.250 mm"

@@ -167,6 +167,14 @@ def test_a_key_point_that_was_never_measured_says_nothing(arm, lagging, problem)
     assert shown == pytest.approx(lag_share(problem), rel=0.07)
 
 
+def test_cameras_may_see_one_key_point_in_one_row_and_another_in_the_next(arm, lagging, problem):
+    """No row has all key points: each counts where it was measured."""
+    points = lagging.key_points_mm.copy()
+    points[::2, ::2] = points[1::2, 1::2] = np.nan
+    shown = lag_share(problem_of(arm, [replace(lagging, key_points_mm=points)]))
+    assert shown == pytest.approx(lag_share(problem), rel=0.1)
+
+
 def test_a_recording_that_shows_no_effect_speaks_against_each_of_them(arm):
     """Its evidence is below 0, and amplitudes are then not taken from it: several may be true."""
     question = pose_question(arm, problem_of(arm, [measured(1200)]), ["line_lag", "creep"])

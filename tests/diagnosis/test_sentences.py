@@ -434,13 +434,14 @@ def test_warnings_about_recordings_are_a_sentence_each():
     holes[:5] = np.nan
     lost = np.zeros((10, 6, 3))
     lost[:, 1, 2] = np.nan
-    unknown, held = table("unknown"), table("holds")
+    unknown, held, smooth = table("unknown"), table("holds"), table("second differences")
     for fields, message in (
         ({}, None),
         ({"measured": holes}, "50 % of the key points are missing"),
         ({"measured": lost}, "key point k1 is missing in every row: an effect that moves it alone"),
         ({"motion": np.zeros(8, int)}, "their 8 blocks of time show 1 different motions"),
-        ({"table": unknown}, "state noise_mm in the sidecar for a better noise floor"),
+        ({"table": smooth}, "second differences in time; state noise_mm in the sidecar for a"),
+        ({"table": unknown}, "the noise floor is not known; state noise_mm in the sidecar"),
         (
             {"table": table(commanded=0.0)},
             "measured and commanded actuation are equal in every row",

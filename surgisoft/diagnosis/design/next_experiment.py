@@ -226,20 +226,27 @@ def _best_of_each(sizes: Sizes, gains: np.ndarray) -> list[int]:
 def _with(residual, seen, design: Design, sensitivities, uncertainty: Uncertainty) -> Moments:
     """Moments of the sensitivities, with the residual (S, n, 3) as the last one.
 
-    seen: (n,) bool, the key points that were measured; the others say nothing.
+    seen: (S, n) bool, the key points that were measured; the others say nothing.
     """
-    columns = [each * seen[:, None, None] for each in (*sensitivities, residual[..., None])]
+    columns = [each * seen[..., None, None] for each in (*sensitivities, residual[..., None])]
     return moments_of(design, columns, uncertainty)
 
 
 def _thinned(problem: Problem) -> tuple[Design, np.ndarray, np.ndarray]:
-    """A problem's rows as a design, their residual (S, n, 3) in mm, and which key points (n,) were
-    measured: not those that are missing in most rows, whose residual is 0."""
-    residual = problem.residual
-    known = np.isfinite(residual).all(2)
+    """A problem's rows as a design, their residual (S, n, 3) in mm, and which key points (S, n)
+    were measured: the residual of the others is 0.
+
+    Rows without one of the key points that most rows have are left out, unless they are most rows:
+    cameras may see one key point in one row and another in the next.
+    """
+    known = np.isfinite(problem.residual).all(2)
     often = known.mean(0) >= 0.5
-    residual = np.where(often[None, :, None], residual, 0.0)
     whole = np.flatnonzero((known | ~often).all(1))
+    if len(whole) < len(known) / 2:
+        seen, whole = known, np.arange(len(known))
+    else:
+        seen = np.broadcast_to(often, known.shape)
+    residual = np.where(seen[..., None], problem.residual, 0.0)
     rows = whole[:: max(1, round(len(whole) / KNOWN_ROWS))]
     history = problem.history
     seconds = float(history.dt_s.sum()) + sample_time(history) * history.runs
@@ -251,7 +258,7 @@ def _thinned(problem: Problem) -> tuple[Design, np.ndarray, np.ndarray]:
         problem.direction[rows],
         seconds,
     )
-    return design, residual[rows], often
+    return design, residual[rows], seen[rows]
 
 
 def _sharp(problem: Problem, sizes: Sizes, fitted: list[np.ndarray], gains) -> list[Form]:

@@ -12,7 +12,7 @@ from surgisoft.diagnosis.diagnose import Diagnosis
 from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
 from surgisoft.diagnosis.improve import NETWORK, Improvement, Round
 from surgisoft.diagnosis.pages.pictures import bodies, save
-from surgisoft.diagnosis.residuals import ResidualTable
+from surgisoft.diagnosis.residuals import ResidualTable, floor_in_words
 from surgisoft.errors import counted
 from surgisoft.files import new_file
 from surgisoft.report import (
@@ -61,7 +61,7 @@ def amend_page(result: Amendment, title: str, about: str) -> Page:
             ("before", f"{fall.before:.3f} mm"),
             (f"after{of_model}", f"{fall.after:.3f} mm"),
             ("after, effects alone", f"{alone.after:.3f} mm"),
-            ("noise floor", f"{fall.floor:.3f} mm"),
+            ("noise floor", floor_in_words(fall.floor, ".3f")),
             (f"reduction, 95 %{of_model}", _interval(fall)),
             *([("reduction, 95 %, effects alone", _interval(alone))] if result.retuned else []),
             ("held-out rows", f"{fall.rows}"),
@@ -214,7 +214,7 @@ def improve_page(
         [
             ("before", f"{fall.before:.3f} mm"),
             ("after", f"{fall.after:.3f} mm"),
-            ("noise floor", f"{fall.floor:.3f} mm"),
+            ("noise floor", floor_in_words(fall.floor, ".3f")),
             ("reduction, 95 %", _interval(fall)),
             ("steps", f"{len(result.steps)}"),
             *_of_model(result.model_error),

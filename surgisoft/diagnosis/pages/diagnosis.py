@@ -8,6 +8,7 @@ from surgisoft.diagnosis.decision import Probabilities
 from surgisoft.diagnosis.diagnose import LOCAL, Diagnosis
 from surgisoft.diagnosis.pairs import ChangeTrack
 from surgisoft.diagnosis.refit import Refit
+from surgisoft.diagnosis.residuals import floor_in_words
 from surgisoft.diagnosis.setup import SetupFault, SetupResult
 from surgisoft.report import Command, Facts, Page, Part, Section, Share, Table, Text, write_page
 from surgisoft.report.style import MUTED
@@ -74,7 +75,7 @@ def diagnosis_page(found: Diagnosis, title: str, command: str = "") -> Page:
     error, verdict = found.error_mm, found.verdict
     facts = [
         ("error" if found.track is None else "change", f"{error.before:.3f} mm"),
-        ("noise floor", f"{error.floor:.3f} mm"),
+        ("noise floor", floor_in_words(error.floor, ".3f")),
         ("best achievable error", f"{error.best_achievable:.3f} mm"),
         ("time", f"{found.seconds:.1f} s"),
     ]

@@ -4,6 +4,7 @@
     python -m benchmarks.gpu --compile
     python -m benchmarks.gpu --agree all
     python -m benchmarks.gpu --preset robust --arm FOLDER
+    python -m benchmarks.gpu --learn 1,2,3 --tasks track_circle --envs 512 --steps 600000
 
 --preset: a preset of `surgisoft train`, with the world that it trains in. --arm: a model for every
 arm of a task. With --agree a table of the largest differences between episodes stepped as CUDA
@@ -11,6 +12,8 @@ graphs and the same ones on the CPU, with the same random actions and resets: ke
 clearance, mm, the beam's end, mm, how many beams meet another thing, lines of sight that differ,
 and dose, as a share of the largest. Otherwise steps per second on the clock, with random actions
 and all resets, and of whole iterations of PPO; a step of the world and its parts in milliseconds.
+With --learn whole trainings of these seeds, as CUDA graphs and on the CPU: each agent's mean reward
+in the last iterations, and the time of one of these.
 """
 
 from __future__ import annotations
@@ -138,12 +141,40 @@ def ppo(plan: Plan, device: torch.device) -> tuple[float, float]:
     return steps / (time.perf_counter() - begin), first
 
 
+def learned(plan: Plan, device: torch.device) -> tuple[dict[str, float], float]:
+    """Mean reward of each agent in the last iterations of a whole training; s of one of them."""
+    training = Training(plan, make_task(plan.task, plan.task_config, device), Processes())
+    rewards, begin = [], [time.perf_counter()]
+    while training.share < 1.0:
+        rewards.append(training.iterate().gathered.rewards)
+        begin.append(time.perf_counter())
+    last = rewards[-ITERATIONS:]
+    means = {agent: sum(each[agent] for each in last) / len(last) for agent in training.agents}
+    return means, (begin[-1] - begin[-1 - len(last)]) / len(last)
+
+
+def compare_learning(plans: list[Plan], seeds: list[int], device: torch.device) -> None:
+    """Print what whole trainings of these seeds reach on the GPU and on the CPU."""
+    print("| task | envs | steps | seed | on | reward of a step at the end | ms an iteration |")
+    print("|---|---|---|---|---|---|---|")
+    for plan in plans:
+        for seed in seeds:
+            for place in (device, torch.device("cpu")):
+                means, seconds = learned(replace(plan, seed=seed), place)
+                told = ", ".join(f"{agent} {value:.4f}" for agent, value in means.items())
+                cells = [plan.task, f"{plan.preset.envs:,}", f"{plan.steps:,}", str(seed)]
+                cells += [place.type, told, f"{1e3 * seconds:.0f}"]
+                print("| " + " | ".join(cells) + " |", flush=True)
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--tasks", default="track_circle,circle_ablation")
     parser.add_argument("--envs", default="4096,16384,65536")
     parser.add_argument("--agree", default="")
+    parser.add_argument("--learn", default="", help="seeds of whole trainings")
+    parser.add_argument("--steps", type=int, help="steps of these; default: those of the task")
     parser.add_argument("--preset", default="fast", choices=PRESETS)
     parser.add_argument("--arm", type=Path, help="folder of a model, for every arm")
     parser.add_argument("--compile", action="store_true", help="the arms by torch.compile, too")
@@ -165,10 +196,23 @@ def main() -> None:
             found = differences(name, device, planned(name).task_config)
             print(f"| {name} | " + ", ".join(f"{k} {v:.1e}" for k, v in found.items()) + " |")
         return
+    counts = [int(count) for count in chosen.envs.split(",")]
+    if chosen.learn:
+        plans = [
+            replace(
+                plan,
+                preset=replace(plan.preset, envs=envs),
+                steps=plan.steps if chosen.steps is None else chosen.steps,
+            )
+            for plan in map(planned, chosen.tasks.split(","))
+            for envs in counts
+        ]
+        compare_learning(plans, [int(seed) for seed in chosen.learn.split(",")], device)
+        return
     print("| task | envs | world, steps/s | step ms | observe ms | PPO, steps/s | first s | GiB |")
     print("|---|---|---|---|---|---|---|---|")
     for name in chosen.tasks.split(","):
-        for envs in (int(count) for count in chosen.envs.split(",")):
+        for envs in counts:
             torch.cuda.reset_peak_memory_stats()
             plan = planned(name)
             plan = replace(plan, preset=replace(plan.preset, envs=envs, compile=chosen.compile))

@@ -37,6 +37,7 @@ class DoseKernel:
             there(np.stack([getattr(one, name) for one in patches]), torch.int32)
             for name in ("zone", "station")
         )
+        self._sums: torch.Tensor | None = None
         samples = (there(patch.points_mm), there(patch.normals), there(patch.areas_mm2))
         least, starts = there(counted), there(grid.starts, torch.int64)
         # Warp's arrays do not own their memory.
@@ -70,9 +71,14 @@ class DoseKernel:
         beams, power = [held(t) for t in (began, ended, direction)], energy.float().contiguous()
         rings = ring.contiguous()
         given = [*map(vectors, beams), wp.from_torch(power), wp.from_torch(rings)]
-        changed = [wp.from_torch(one) for one in sums]
-        arguments = [*given, *self._constants, *changed, RING]
-        launch(kernels.deposit, len(rings), arguments, beams[0])
+        dose, peak, band, area, joule = (wp.from_torch(one) for one in sums)
+        shape = (len(rings), 6 + band.shape[1])
+        if self._sums is None or self._sums.shape != shape:
+            self._sums = torch.zeros(shape, dtype=torch.int64, device=beams[0].device)
+        added = wp.from_torch(self._sums)
+        arguments = [*given, *self._constants, dose, peak, added, RING]
+        launch(kernels.deposit, (len(rings), kernels.LANES), arguments, beams[0])
+        launch(kernels.deposited, shape, [added, joule, area, band], beams[0])
 
 
 def cut_warp(

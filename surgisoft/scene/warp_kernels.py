@@ -1,4 +1,4 @@
-"""Kernels of NVIDIA Warp: clearance, rays and dose, one thread for each query.
+"""Kernels of NVIDIA Warp: clearance, rays and dose, one thread for each query, or a few.
 
 They walk the same tree and field as the compiled queries of `bvh`, `distance`, `rays` and
 `ablation`, in float64, so that results agree to rounding; the formulas and their sources stand
@@ -792,6 +792,13 @@ def chains_folded(lines: Points2, radius: real, gap: real, horizon: real, out: N
     out[b] = best - TWO * radius
 
 
+LANES = 32
+"""Threads that share the samples of one environment's sweep."""
+UNIT = wp.constant(wp.float64(2.0**-40))
+"""Unit of sums of areas [mm^2] and energies [J] in whole numbers, which the order of the threads
+does not change."""
+
+
 @wp.kernel
 def deposit(
     began: Points,
@@ -814,16 +821,16 @@ def deposit(
     starts: Whole,
     dose: Singles2,
     peak: Singles2,
-    band: Singles2,
-    area: Singles2,
-    joule: Singles2,
+    sums: Whole2,
     in_ring: int,
 ):
-    """Add the sweep of environment `tid` to the samples near its path; see `ablation._deposit`.
+    """Add the sweep of environment `tid[0]` to the samples near its path; see `ablation._deposit`.
 
-    in_ring: number of the zone that is the ring.
+    Its `LANES` threads divide each column of cubes, whose samples lie one after another. sums (B,
+    6 + stations): energy and area of each zone and area of each station, in `UNIT`; `deposited`
+    adds them up. in_ring: number of the zone that is the ring.
     """
-    n = wp.tid()
+    n, lane = wp.tid()
     if not energy[n] > wp.float32(0.0):
         return
     scale = wp.sqrt(TWO) / waist
@@ -839,51 +846,70 @@ def deposit(
         high[axis] = wp.min(
             cells[axis] - 1, int(wp.floor(wp.clamp(far / cell, wp.float64(-2.0), wp.float64(1e6))))
         )
+    if low[2] > high[2]:
+        return
     m = ended[n] - p
     m = m - wp.dot(m, d) * d
     length = wp.length(m)
     moving = length > wp.float64(1e-5) * waist
     m = wp.where(moving, m / wp.max(length, wp.float64(1e-300)), vec(ZERO, ZERO, ZERO))
     strength = TWO * wp.float64(energy[n]) / (wp.float64(wp.pi) * waist * waist)
+    heat = vec(ZERO, ZERO, ZERO)
+    burnt = vec(ZERO, ZERO, ZERO)
     for ci in range(low[0], high[0] + 1):
         for cj in range(low[1], high[1] + 1):
-            for ck in range(low[2], high[2] + 1):
-                cube = (ci * cells[1] + cj) * cells[2] + ck
-                middle = vec(wp.float64(ci) + HALF, wp.float64(cj) + HALF, wp.float64(ck) + HALF)
-                x = origin + cell * middle - p
-                along = wp.clamp(wp.dot(x, m), ZERO, length)
-                x = x - wp.dot(x, d) * d - along * m
-                wide = reach + wp.float64(0.87) * cell
-                if wp.length_sq(x) <= wide * wide:
-                    for s in range(int(starts[cube]), int(starts[cube + 1])):
-                        cosine = -wp.dot(d, normals[s])
-                        if cosine > ZERO:
-                            y = points[s] - p
-                            y = y - wp.dot(y, d) * d
-                            way = wp.dot(y, m)
-                            across2 = wp.dot(y, y) - way * way
-                            beside = across2 > reach * reach
-                            if not (beside or way < -reach or way > length + reach):
-                                profile = wp.exp(-scale * scale * wp.max(across2, ZERO))
-                                if moving:
-                                    span = wp.erf(scale * way) - wp.erf(scale * (way - length))
-                                    root = wp.sqrt(wp.float64(wp.pi))
-                                    profile = profile * HALF * root * span / (scale * length)
-                                gain = strength * profile * cosine
-                                old = wp.float64(dose[n, s])
-                                after = old + gain
-                                kind = zones[int(ring[n]), s]
-                                station = stations[int(ring[n]), s]
-                                joule[n, kind] = wp.float32(
-                                    wp.float64(joule[n, kind]) + gain * areas[s]
-                                )
-                                if after >= counted[kind] and old < counted[kind]:
-                                    area[n, kind] = area[n, kind] + wp.float32(areas[s])
-                                    if kind == in_ring:
-                                        band[n, station] = band[n, station] + wp.float32(areas[s])
-                                if kind == in_ring and after > wp.float64(peak[n, station]):
-                                    peak[n, station] = wp.float32(after)
-                                dose[n, s] = wp.float32(after)
+            column = (ci * cells[1] + cj) * cells[2]
+            s = int(starts[column + low[2]]) + lane
+            end = int(starts[column + high[2] + 1])
+            while s < end:
+                cosine = -wp.dot(d, normals[s])
+                y = points[s] - p
+                y = y - wp.dot(y, d) * d
+                way = wp.dot(y, m)
+                across2 = wp.dot(y, y) - way * way
+                beside = across2 > reach * reach or way < -reach or way > length + reach
+                if cosine > ZERO and not beside:
+                    profile = wp.exp(-scale * scale * wp.max(across2, ZERO))
+                    if moving:
+                        span = wp.erf(scale * way) - wp.erf(scale * (way - length))
+                        root = wp.sqrt(wp.float64(wp.pi))
+                        profile = profile * HALF * root * span / (scale * length)
+                    gain = strength * profile * cosine
+                    old = wp.float64(dose[n, s])
+                    after = old + gain
+                    kind = zones[int(ring[n]), s]
+                    heat[kind] = heat[kind] + gain * areas[s]
+                    if after >= counted[kind] and old < counted[kind]:
+                        burnt[kind] = burnt[kind] + areas[s]
+                        if kind == in_ring:
+                            station = stations[int(ring[n]), s]
+                            area = wp.int64(wp.rint(areas[s] / UNIT))
+                            wp.atomic_add(sums, n, 6 + station, area)
+                    if kind == in_ring:
+                        wp.atomic_max(peak, n, stations[int(ring[n]), s], wp.float32(after))
+                    dose[n, s] = wp.float32(after)
+                s = s + LANES
+    for kind in range(3):
+        if heat[kind] > ZERO:
+            wp.atomic_add(sums, n, kind, wp.int64(wp.rint(heat[kind] / UNIT)))
+        if burnt[kind] > ZERO:
+            wp.atomic_add(sums, n, 3 + kind, wp.int64(wp.rint(burnt[kind] / UNIT)))
+
+
+@wp.kernel
+def deposited(sums: Whole2, joule: Singles2, area: Singles2, band: Singles2):
+    """Add sum `tid[1]` of environment `tid[0]` to what it is a sum of, and set it to 0."""
+    n, k = wp.tid()
+    if sums[n, k] == wp.int64(0):
+        return
+    more = wp.float64(sums[n, k]) * UNIT
+    if k < 3:
+        joule[n, k] = wp.float32(wp.float64(joule[n, k]) + more)
+    elif k < 6:
+        area[n, k - 3] = wp.float32(wp.float64(area[n, k - 3]) + more)
+    else:
+        band[n, k - 6] = wp.float32(wp.float64(band[n, k - 6]) + more)
+    sums[n, k] = wp.int64(0)
 
 
 @wp.kernel

@@ -26,9 +26,14 @@ SUMMARIES: dict[str, Callable[[Rollout, str], Tensor]] = {
     "completion": Rollout.end,
     "largest_gap_mm": Rollout.end,
     "healthy_mm2": Rollout.end,
+    "inside_mm2": Rollout.end,
+    "visited": Rollout.end,
+    "at_rim_s": Rollout.end,
     "success": Rollout.end,
     "collided": Rollout.largest,
     "clearance_mm": Rollout.smallest,
+    "beam_clearance_mm": Rollout.smallest,
+    "rim_mm": Rollout.smallest,
 }
 """Measure -> how an episode is summarised; errors have four summaries, others the mean."""
 RATES = ("success", "collided", "failed")

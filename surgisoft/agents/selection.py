@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from surgisoft.agents.evaluate import SUMMARIES
 from surgisoft.agents.policies import Policy
 from surgisoft.agents.rollout import EpisodeRecorders, rollout
 from surgisoft.tasks.base import Task
@@ -19,18 +20,17 @@ def evaluate_checkpoint(
     """Means over validation episodes without exploration noise, and the first episode's log.
 
     error_mm: mean over steps and episodes of the task's first error; success: share of episodes,
-    absent where a task has none; the other measures by their names.
+    absent where a task has none; the other measures by their names, each summarised in an episode
+    as `evaluate.SUMMARIES` says, or the mean over steps and episodes where it does not.
     """
     watch = EpisodeRecorders(task, "learned", SEED, only=0)
     result = rollout(task, policy, episodes, SEED, watch=watch)
     means = {}
     for name, trace in result.measures.items():
-        if name == "success":
-            means[name] = result.end(name).mean().item()
+        if name in SUMMARIES:
+            means[name] = SUMMARIES[name](result, name).nanmean().item()
         elif name.endswith("error_mm") and "error_mm" not in means:
             means["error_mm"] = trace.nanmean().item()
-        elif name in ("completion", "largest_gap_mm", "healthy_mm2"):
-            means[name] = result.end(name).nanmean().item()
         else:
             means[name] = trace.nanmean().item()
     return means, watch.log(0)

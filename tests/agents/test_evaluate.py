@@ -102,7 +102,12 @@ def test_each_measure_has_its_summary():
         view_fraction=[[need, 0.0, need], [0.0, 0.0, NAN]],
         success=[[0.0, 0.0, 1.0], [0.0, 0.0, NAN]],
         clearance_mm=[[5.0, 2.0, 3.0], [4.0, 6.0, NAN]],
+        beam_clearance_mm=[[3.0, 1.5, 2.0], [7.0, 8.0, NAN]],
+        rim_mm=[[9.0, 1.0, 5.0], [2.0, 3.0, NAN]],
         collided=[[0.0, 0.0, 0.0], [0.0, 1.0, NAN]],
+        inside_mm2=[[0.0, 1.0, 4.0], [0.0, 2.0, NAN]],
+        visited=[[0.0, 0.5, 1.0], [0.0, 0.25, NAN]],
+        at_rim_s=[[0.0, 0.1, 0.1], [0.0, 0.1, NAN]],
     )
     table = episode_table(task, played)
     expected = {
@@ -113,7 +118,12 @@ def test_each_measure_has_its_summary():
         "completion": [1.0, 0.3],
         "in_view": [2 / 3, 0.0],
         "clearance_mm": [2.0, 4.0],
+        "beam_clearance_mm": [1.5, 7.0],
+        "rim_mm": [1.0, 2.0],
         "collided": [0.0, 1.0],
+        "inside_mm2": [4.0, 2.0],
+        "visited": [1.0, 0.25],
+        "at_rim_s": [0.1, 0.1],
         "success": [1.0, 0.0],
         "time_s": [0.3, 0.2],
     }

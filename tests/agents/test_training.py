@@ -573,14 +573,18 @@ def test_the_better_checkpoint_is_kept():
 
 
 def test_an_evaluation_is_means_over_episodes_of_the_right_steps(monkeypatch):
-    """Two episodes of three and two steps: an error counts in every step, success at the end."""
+    """Two episodes of three and two steps: an error counts in every step, success at the end, the
+    least clearance and any contact."""
     nan = float("nan")
     table = {
         "beam_error_mm": [[3.0, 4.0, nan], [nan, 1.0, nan]],
         "tissue_error_mm": [[5.0, 7.0, nan], [nan, 9.0, nan]],
         "success": [[1.0, 0.0, 1.0], [1.0, 0.0, nan]],
         "completion": [[0.2, 0.5, 0.7], [0.1, 0.3, nan]],
+        "visited": [[0.0, 0.5, 1.0], [0.0, 0.5, nan]],
         "clearance_mm": [[1.0, 2.0, 3.0], [5.0, 5.0, nan]],
+        "collided": [[0.0, 0.0, 0.0], [0.0, 1.0, nan]],
+        "view_fraction": [[1.0, 1.0, 0.0], [0.5, 0.0, nan]],
     }
     over = torch.tensor([False, True])
     measures = {name: torch.tensor(value) for name, value in table.items()}
@@ -596,7 +600,10 @@ def test_an_evaluation_is_means_over_episodes_of_the_right_steps(monkeypatch):
             "tissue_error_mm": 7.0,
             "success": 0.5,
             "completion": 0.5,
-            "clearance_mm": 3.2,
+            "visited": 0.75,
+            "clearance_mm": 3.0,
+            "collided": 0.5,
+            "view_fraction": 0.5,
         }
     )
 

@@ -82,9 +82,11 @@ def new(
         ),
     ] = None,
     margin: Annotated[
-        float,
-        typer.Option(metavar="MM", help="Distance of the ring from a segmented lesion, mm."),
-    ] = 5.0,
+        float | None,
+        typer.Option(
+            metavar="MM", help="Distance of the ring from a segmented lesion, mm; default: 5."
+        ),
+    ] = None,
     clearance: Annotated[
         float,
         typer.Option(metavar="MM", help="Least distance between an arm and anything else, mm."),

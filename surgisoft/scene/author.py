@@ -99,8 +99,8 @@ class Request:
     (anterior) for segmented images, else z."""
     labels: tuple[Label, ...] = ()
     """Labels of a segmented image that become bodies, and the lesion."""
-    margin_mm: float = MARGIN_MM
-    """Distance of the ring from a segmented lesion (mm)."""
+    margin_mm: float | None = None
+    """Distance of the ring from a segmented lesion (mm); None: MARGIN_MM."""
     lesion: tuple[float, float, float] | None = None
     """Point near which the lesion goes, in the first file's own frame and unit."""
     lesion_direction: tuple[float, float, float] | None = None
@@ -116,7 +116,7 @@ class Request:
     """The limits."""
 
     def __post_init__(self):
-        """Raise InputError for contradicting places of the lesion and for lengths out of range."""
+        """Raise InputError for contradicting or idle options and for lengths out of range."""
         point, direction, diameter_mm = self.lesion, self.lesion_direction, self.diameter_mm
         if point is not None and direction is not None:
             raise InputError("both --lesion and --lesion-direction are given; expected one of them")
@@ -130,8 +130,37 @@ class Request:
         if diameter_mm is not None and not low <= diameter_mm <= high:
             raise InputError(f"--diameter is {diameter_mm:g}; expected {low:g} to {high:g} mm")
         for name, value in (("margin", self.margin_mm), ("clearance", self.limits.clearance_mm)):
-            if not 0.0 <= value <= WIDEST_MM:
+            if value is not None and not 0.0 <= value <= WIDEST_MM:
                 raise InputError(f"--{name} is {value:g}; expected 0 to {WIDEST_MM:g} mm")
+        self._check_idle()
+
+    def _check_idle(self) -> None:
+        """Raise InputError for a margin, a unit or a scale that would have no effect."""
+        images = [path for path in self.meshes if is_segmentation(path)]
+        for name, given in (("unit", self.unit), ("scale", self.scale)):
+            if given is not None and images and len(images) == len(self.meshes):
+                raise InputError(
+                    f"--{name} is given for {images[0]}, a segmented image, whose header states "
+                    f"the size of its voxels; leave --{name} out"
+                )
+        if self.margin_mm is None:
+            return
+        if self.diameter_mm is not None:
+            raise InputError(
+                "both --diameter and --margin are given, and each sets the size of the ring; "
+                "expected one of them"
+            )
+        if self.lesion is not None or self.lesion_direction is not None:
+            other = "lesion" if self.lesion is not None else "lesion-direction"
+            raise InputError(
+                f"--margin is given beside --{other}; expected it for a segmented lesion alone: "
+                "give --diameter"
+            )
+        if not images or (self.labels and all(one.role != "lesion" for one in self.labels)):
+            raise InputError(
+                "--margin is given without a segmented lesion; expected an image with --label "
+                "LABEL:lesion, or --diameter in place of --margin"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -398,7 +427,8 @@ def ring_diameter(request: Request, prepared: Prepared) -> float:
     if prepared.lesion_mm is None or request.lesion or request.lesion_direction:
         return DIAMETER_MM
     _, radius, _ = segmented_lesion(prepared)
-    return round(2.0 * (radius + request.margin_mm), 1)
+    margin_mm = MARGIN_MM if request.margin_mm is None else request.margin_mm
+    return round(2.0 * (radius + margin_mm), 1)
 
 
 def segmented_lesion(prepared: Prepared) -> tuple[np.ndarray, float, float]:
@@ -434,7 +464,7 @@ def author(
     """
     prepared = prepare(request, report)
     report(5, 100, "meshes read")
-    request = replace(request, diameter_mm=ring_diameter(request, prepared))
+    request = replace(request, diameter_mm=ring_diameter(request, prepared), margin_mm=None)
     sites = choose_sites(request, prepared)
     report(10, 100, "lesion placed")
     failures: list[tuple[float, str]] = []

@@ -415,6 +415,8 @@ BAD = [
     (("ball.ply", "--label", "1:organ"), "--label is given for meshes"),
     (("ball.ply", "--label", "1"), "expected LABEL:ROLE[:NAME]"),
     (("ball.ply", "--margin", "-1"), "--margin is -1"),
+    (("ball.ply", "--margin", "3"), "--margin is given without a segmented lesion"),
+    (("ball.ply", "--margin", "3", "--diameter", "20"), "both --diameter and --margin"),
     (("ball.ply", "--arm", "scope=default"), "unknown arm 'scope'"),
     (("ball.ply", "--arms", "laser,knife"), "unknown tool 'knife'"),
     (("ball.ply", "--arms", "laser,laser", "--arm", "laser_3=default"), "unknown arm 'laser_3'"),

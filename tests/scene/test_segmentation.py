@@ -244,9 +244,37 @@ def test_the_ring_lies_above_the_lesion_with_its_margin(nifti):
     assert np.linalg.norm(site.point_mm - middle) <= distances.min() + 0.1
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--unit", "cm"), "--unit is given for {image}, a segmented image, whose header"),
+        (("--scale", "10"), "--scale is given for {image}, a segmented image, whose header"),
+        (("--margin", "3", "--diameter", "20"), "both --diameter and --margin are given"),
+        (("--margin", "3", "--lesion", "0", "0", "0"), "--margin is given beside --lesion"),
+        (("--margin", "3", "--lesion-direction", "0", "0", "1"), "beside --lesion-direction"),
+    ],
+)
+def test_an_option_without_effect_on_an_image_is_refused(options, message, nifti, tmp_path, capsys):
+    words = [word for one in LABELS for word in ("--label", f"{one.key}:{one.role}:{one.name}")]
+    target = tmp_path / "scene"
+    assert run(["scene", "new", str(nifti), *words, *options, "-o", str(target)]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert message.format(image=nifti) in line
+    assert not target.exists()
+
+
+def test_a_margin_needs_a_lesion_among_the_labels(nifti, tmp_path):
+    organ = tuple(one for one in LABELS if one.role != "lesion")
+    with pytest.raises(InputError, match="--margin is given without a segmented lesion"):
+        Request((nifti,), ("organ",), labels=organ, margin_mm=4.0)
+    meshes = (nifti, tmp_path / "bone.stl")
+    assert Request(meshes, ("organ", "support"), labels=organ, unit="cm").unit == "cm", "the mesh's"
+
+
 def test_a_segmented_patient_becomes_a_scene(nifti, tmp_path, capsys):
     labels = [f"{one.key}:{one.role}:{one.name}" for one in LABELS]
     options = [word for label in labels for word in ("--label", label)]
+    options += ["--margin", "4.5"]
     assert run(["scene", "new", str(nifti), *options, "-o", str(tmp_path / "scene")]) == 0
     said = capsys.readouterr().out
     assert "segmented lesion: 1" in said

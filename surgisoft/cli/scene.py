@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import show_written
+from surgisoft.cli.files import check_folder, show_written
 from surgisoft.cli.options import EffectFiles, Force, Port, SaveReplay, Screenshot, Web
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
@@ -173,16 +173,21 @@ def check(
     from surgisoft.tasks.world.reach import reaches_of
 
     scene = open_scene(folder)
+    if picture is not None:
+        from surgisoft.replay.reach_map import check_map
+
+        check_map(scene, picture)
+        check_folder(picture.absolute().parent)
     reaches = reaches_of(scene)
     with progress("scene check") as report:
         verdict = check_scene(scene, reaches, report)
-    drawn = picture is not None and verdict.work is not None
-    if picture is not None and drawn:
+    _print_check(verdict)
+    if picture is not None and verdict.work is None:
+        print(f"{picture}: not drawn, because the ring does not lie on the organ")
+    elif picture is not None:
         from surgisoft.replay.reach_map import draw_reach_map
 
         draw_reach_map(scene, verdict, reach_patches(scene, reaches), picture)
-    _print_check(verdict)
-    if drawn:
         print(f"wrote {picture}")
     return 0 if verdict.good else 1
 
@@ -199,6 +204,7 @@ def show(
     """View a scene in the Rerun viewer: organs, arms, ring, beam and the camera's cone."""
     from surgisoft.replay.scene_view import save_scene_view
     from surgisoft.replay.viewer import (
+        check_picture,
         open_viewer,
         serve_viewer,
         take_screenshot,
@@ -209,6 +215,8 @@ def show(
 
     if port is not None and not web:
         raise InputError("--port applies to a browser only: give --web too")
+    if screenshot is not None:
+        check_picture(screenshot)
     scene = open_scene(folder)
     reaches = reaches_of(scene)
     if save is not None:

@@ -16,6 +16,16 @@ REASON_COLOURS = ("#2a9d4a", "#5b6472", "#b5651d", "#7b2d8b", "#c1121f", "#1d5fa
 """Colour of each reason, in the order of REASONS."""
 
 
+def check_map(scene: Scene, path: Path) -> None:
+    """Raise InputError where the map of a scene cannot be drawn to a file, whatever its verdict."""
+    if path.suffix.lower() != ".png":
+        raise InputError(f"{path}: suffix '{path.suffix}', expected .png")
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder, expected a file to write")
+    if not scene.spec.arms_with("laser"):
+        raise InputError("no arm of the scene carries a laser, so there is no map to draw")
+
+
 def draw_reach_map(
     scene: Scene, verdict: SceneCheck, patches: Mapping[str, Patch], path: Path
 ) -> None:
@@ -23,14 +33,10 @@ def draw_reach_map(
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    path = Path(path)
-    if path.suffix.lower() != ".png":
-        raise InputError(f"{path}: suffix '{path.suffix}', expected .png")
-    work = verdict.work
+    path, work = Path(path), verdict.work
+    check_map(scene, path)
     if work is None:
         raise InputError("the ring does not lie on the organ, so there is no map to draw")
-    if not patches:
-        raise InputError("no arm of the scene carries a laser, so there is no map to draw")
     figure = Figure(figsize=(12.0, 5.6 * len(patches)), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(len(patches), 2, width_ratios=(1.0, 1.15), squeeze=False)
@@ -49,7 +55,6 @@ def draw_reach_map(
     figure.suptitle(f"{scene.spec.name}: {sentence(verdict)}", fontsize=9, wrap=True)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, buffer.getvalue())
 
 

@@ -11,6 +11,7 @@ from surgisoft.replay.episode_view import Replay, layout_names, write_replay
 from surgisoft.replay.recording import SUFFIX
 from surgisoft.replay.viewer import (
     NotebookView,
+    check_picture,
     check_view,
     open_viewer,
     parse_size,
@@ -108,6 +109,8 @@ def open_replay(
         raise InputError("--port applies to a browser only: give --web too")
     if screenshot is None and (time_s is not None or view is not None):
         raise InputError("--time and --view apply to a picture only: give --screenshot too")
+    if screenshot is not None:
+        check_picture(Path(screenshot))
     if view is not None and found.suffix != SUFFIX:
         check_view(view, layout_names(load_episode(found)))
     if save is not None:

@@ -226,6 +226,16 @@ def check_view(view: str, names: Sequence[str]) -> None:
         raise unknown_name("view", view, sorted(names))
 
 
+def check_picture(picture: Path) -> None:
+    """Raise InputError where a screenshot cannot be written to this file."""
+    if picture.suffix.lower() != ".png":
+        raise InputError(f"{picture}: suffix '{picture.suffix}', expected .png")
+    if picture.is_dir():
+        raise InputError(f"{picture}: is a folder, expected a file to write")
+    if not picture.parent.is_dir():
+        raise InputError(f"{picture.parent}: there is no such folder for the picture")
+
+
 def take_screenshot(
     recording: Path,
     picture: Path,
@@ -243,10 +253,7 @@ def take_screenshot(
     picture = Path(picture)
     if view is not None:
         check_view(view, contents(recording).views)
-    if picture.suffix.lower() != ".png":
-        raise InputError(f"{picture}: suffix '{picture.suffix}', expected .png")
-    if not picture.parent.is_dir():
-        raise InputError(f"{picture.parent}: there is no such folder for the picture")
+    check_picture(picture)
     port = free_port()
     arguments = (str(recording), "--bind", LOCAL, "--port", str(port), "--headless")
     with running(*arguments, "--window-size", f"{size[0]}x{size[1]}") as viewer:

@@ -461,6 +461,9 @@ def test_a_scene_is_shown_where_it_is_asked_for(tmp_path, capsys, monkeypatch):
     assert shown[2][1][:2] == (tmp_path / "a.png", "Scene")
     assert run([*command, "--port", "9099"]) == 2
     assert "--port applies to a browser only: give --web too" in capsys.readouterr().err
+    monkeypatch.setattr("surgisoft.tasks.world.reach.reaches_of", lambda _: pytest.fail("worked"))
+    assert run([*command, "--screenshot", str(tmp_path / "a.jpg")]) == 2
+    assert "suffix '.jpg', expected .png" in capsys.readouterr().err
 
 
 REFUSED = {

@@ -8,7 +8,7 @@ import pytest
 
 from surgisoft.errors import InputError
 from surgisoft.replay import viewer
-from surgisoft.replay.show import MAGIC, find_replay
+from surgisoft.replay.show import MAGIC, find_replay, open_replay
 from surgisoft.replay.viewer import painted
 
 
@@ -21,6 +21,15 @@ def test_the_newest_replay_of_a_run_is_found(tmp_path):
         os.utime(path, (1e9 - age, 1e9 - age))
     assert find_replay(tmp_path) == places[1]
     assert find_replay(places[0]) == places[0]
+
+
+def test_a_picture_that_cannot_be_written_is_told_before_the_replay_is_made(tmp_path, monkeypatch):
+    (tmp_path / "a.npz").touch()
+    (tmp_path / "b.png").mkdir()
+    monkeypatch.setattr("surgisoft.replay.show.load_episode", lambda _: pytest.fail("read"))
+    for name, message in (("a.jpg", "expected .png"), ("b.png", "is a folder")):
+        with pytest.raises(InputError, match=message):
+            open_replay(tmp_path / "a.npz", screenshot=tmp_path / name)
 
 
 class Busy:

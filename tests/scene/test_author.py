@@ -249,8 +249,12 @@ def test_the_worst_moment_of_the_view_counts(made, monkeypatch):
 
 def test_a_lesion_off_the_organ_is_a_verdict(made, tmp_path, capsys):
     folder = scene_with(made, tmp_path, lesion=LesionSpec("organ", (0.0, 0.0, 300.0)))
-    assert run(["scene", "check", str(folder)]) == 1
-    assert "BAD lesion on the surface" in capsys.readouterr().out
+    picture = tmp_path / "map.png"
+    assert run(["scene", "check", str(folder), "--map", str(picture)]) == 1
+    said = capsys.readouterr().out
+    assert "BAD lesion on the surface" in said
+    assert f"{picture}: not drawn, because the ring does not lie on the organ" in said
+    assert not picture.exists()
 
 
 def test_a_path_off_the_organ_tells_how_far(made, tmp_path, capsys):
@@ -323,6 +327,36 @@ def test_a_map_is_drawn(made, tmp_path):
     colours = np.asarray(Image.open(tmp_path / "map.png").convert("RGB")).reshape(-1, 3)
     green = np.abs(colours.astype(int) - [42, 157, 74]).sum(axis=1) < 30
     assert green.sum() > 500  # the ring's points that can be cut
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("map.jpg", "suffix '.jpg', expected .png"),
+        ("folder.png", "is a folder, expected a file"),
+        ("file/map.png", "is not a writable folder"),
+    ],
+)
+def test_a_map_that_cannot_be_written_is_told_before_the_check(
+    name, message, made, tmp_path, capsys, monkeypatch
+):
+    (tmp_path / "folder.png").mkdir()
+    (tmp_path / "file").touch()
+    checked = []
+    monkeypatch.setattr("surgisoft.scene.check.check_scene", lambda *given: checked.append(given))
+    assert run(["scene", "check", str(made[1]), "--map", str(tmp_path / name)]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert message in line
+    assert not checked
+
+
+def test_a_map_without_a_laser_is_told_before_the_check(made, tmp_path, capsys, monkeypatch):
+    mounts = tuple(m for m in open_scene(made[1]).spec.mounts if m.tool != "laser")
+    folder, checked = scene_with(made, tmp_path, mounts=mounts), []
+    monkeypatch.setattr("surgisoft.scene.check.check_scene", lambda *given: checked.append(given))
+    assert run(["scene", "check", str(folder), "--map", str(tmp_path / "map.png")]) == 2
+    assert "no arm of the scene carries a laser" in capsys.readouterr().err
+    assert not checked
 
 
 def test_a_lid_over_the_lesion_leaves_no_mount(tmp_path, capsys):

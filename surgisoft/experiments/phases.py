@@ -15,6 +15,7 @@ from surgisoft.experiments.spec import Experiment
 from surgisoft.tasks.base import TaskState
 from surgisoft.tasks.episodes.log import EpisodeLog
 from surgisoft.tasks.episodes.parts import Event
+from surgisoft.tasks.registry import MOST_STEPS
 from surgisoft.tasks.supervision import Supervision
 from surgisoft.tasks.world.random_streams import Stream
 
@@ -60,6 +61,11 @@ class PhasedTask:
             raise InputError(
                 f"limits.time_s is {limits.time_s:g} s, expected at least a step of {dt_s:g} s: "
                 "change time_s"
+            )
+        if self.steps > MOST_STEPS:
+            raise InputError(
+                f"limits.time_s is {limits.time_s:g} s, more than {MOST_STEPS:,} steps of {dt_s:g} "
+                "s; expected a shorter time_s or a longer dt_s of the task"
             )
         self.clear_mm = max(limits.clearance_mm, supervision.clearance_limit_mm)
         self.lost_steps = round(limits.view_lost_s / dt_s)

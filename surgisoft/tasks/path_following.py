@@ -147,8 +147,9 @@ class FollowConfig:
         for name in ("size_mm", "loop_s", "loops", "preview", "fine_mm"):
             if not getattr(self, name) > 0:
                 raise InputError(f"task: {name} is {getattr(self, name)}, expected more than 0")
-        if self.history_steps < 0:
-            raise InputError(f"task: history_steps is {self.history_steps}, expected 0 or more")
+        for name in ("approach_s", "history_steps"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"task: {name} is {getattr(self, name)}, expected 0 or more")
         check_weights("task", self.weights)
 
 

@@ -81,6 +81,8 @@ class TrackBodyConfig:
         for name in ("swing_kPa", "slow_s", "fast_s", "time_s", "preview", "fine_mm"):
             if not getattr(self, name) > 0:
                 raise InputError(f"track_body: {name} is {getattr(self, name)}, expected above 0")
+        if not self.approach_s >= 0.0:
+            raise InputError(f"track_body: approach_s is {self.approach_s}, expected 0 or more")
         check_weights("track_body", self.weights)
 
 

@@ -27,6 +27,7 @@ from surgisoft.files import write_json
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.circle_ablation import CircleAblation
 from surgisoft.tasks.laser_supervision import LaserSupervision
+from surgisoft.tasks.registry import with_fields
 from tests.experiments.tiny import FAULT, TINY, write
 from tests.rig.own_rig import OwnRig
 from tests.tasks.test_episode import made_up
@@ -81,6 +82,20 @@ def test_an_episode_has_a_step(tmp_path):
     (setting,) = settings(short)
     with pytest.raises(InputError, match=r"time_s is 0\.04 s, expected at least a step of 0\.1 s"):
         build_task(short, setting)
+
+
+def test_an_episode_has_an_end(tmp_path):
+    """As many steps as any task may have, and one more."""
+    spec = spec_of(tmp_path)
+    fine = replace(spec, task=with_fields(spec.task, dt_s=0.001))
+    (setting,) = settings(fine)
+    longest = replace(fine, limits=replace(fine.limits, time_s=10_000.0))
+    assert build_task(longest, setting).steps == 10_000_000
+    longer = replace(fine, limits=replace(fine.limits, time_s=10_000.001))
+    with pytest.raises(
+        InputError, match=r"time_s is 10000 s, more than 10,000,000 steps of 0\.001"
+    ):
+        build_task(longer, setting)
 
 
 def test_a_lesion_of_an_experiment_lies_on_the_organ(tmp_path):

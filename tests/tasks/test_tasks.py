@@ -604,6 +604,16 @@ def test_an_episode_without_end_is_one_line(change):
         make_task("track_circle", config)
 
 
+@pytest.mark.parametrize("name", ["track_circle", "track_square", "laser_plane", "track_body"])
+def test_no_reference_begins_before_its_episode(name):
+    """The reference waits for a time, or moves at once; steps before the first one do not exist."""
+    at_once = make_task(name, with_fields(config_of(name), approach_s=0.0))
+    assert make_task(name).steps - at_once.steps == 30
+    for wrong in (-1.0, float("nan")):
+        with pytest.raises(InputError, match=f"approach_s is {wrong}, expected 0 or more"):
+            with_fields(config_of(name), approach_s=wrong)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -116,6 +116,8 @@ class SceneEngineConfig:
     def __post_init__(self):
         if self.geometry not in GEOMETRIES:
             raise unknown_name("geometry", self.geometry, GEOMETRIES)
+        if not self.view_points > 0:
+            raise InputError(f"scene_engine: view_points is {self.view_points}, expected 1 or more")
 
 
 class SceneEngine:

@@ -88,6 +88,10 @@ class TrainingRequest:
         )
 
 
+ASSIGNED = {"changes": "FIELD=VALUE", "ppo": "ppo.NAME=VALUE"}
+"""Fields of `TrainingRequest` that the command takes as assignments, as they are written there."""
+
+
 @dataclass(frozen=True)
 class TrainedRun:
     """A training run after its training."""
@@ -129,7 +133,7 @@ def train(
     if resume_from is not None:
         names = [*(["task"] if task else []), *(["output"] if output else []), *fields]
         if names:
-            given = ", ".join(f"--{name.replace('_', '-')}" for name in names)
+            given = ", ".join(ASSIGNED.get(n, f"--{n.replace('_', '-')}") for n in names)
             raise InputError(f"--resume continues with the options of the run: leave out {given}")
         plan, folder = None, Path(resume_from)
     elif task is None:

@@ -55,6 +55,10 @@ def test_trains_and_prints_the_result(tmp_path, capsys):
         ([*SMALL, "--config", "nofile.toml"], "there is no such file"),
         (["--resume", "nowhere"], "no training run there"),
         (["--resume", "nowhere", "--seed", "1"], "leave out --seed"),
+        (
+            ["--resume", "nowhere", "follow.size_mm=12", "ppo.gamma=0.9", "seed=3"],
+            "leave out --seed, ppo.NAME=VALUE, FIELD=VALUE",
+        ),
         (["--task", "track_circle", "--envs", "0"], "--envs"),
     ],
 )

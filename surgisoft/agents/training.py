@@ -35,6 +35,7 @@ from surgisoft.agents.run_folder import BEST, LAST, RunFolder, create_run, damag
 from surgisoft.agents.selection import evaluate_checkpoint, is_better
 from surgisoft.agents.vec_env import JointEnv
 from surgisoft.errors import InputError
+from surgisoft.files import write_atomically
 from surgisoft.tasks.base import Task
 from surgisoft.tasks.episodes.file import save_episode
 from surgisoft.tasks.registry import make_task
@@ -429,7 +430,7 @@ class _Log:
                 with suppress(ValueError, TypeError, KeyError, RecursionError):
                     if json.loads(line)["iteration"] <= iteration:
                         kept.append(line + "\n")
-        file.write_text("".join(kept))
+        write_atomically(file, "".join(kept), noted=False)
         self._file = file.open("a")
 
     def add(self, training: Training, turn: Iteration, found: dict, seconds: float) -> None:

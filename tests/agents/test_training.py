@@ -6,6 +6,7 @@ import shutil
 import signal
 import threading
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -177,6 +178,24 @@ def test_a_kill_between_checkpoints_loses_nothing(run, tmp_path):
     assert_equal(weights(run), weights(RunFolder(killed)))
     rows = [json.loads(row) for row in (killed / "metrics.jsonl").read_text().splitlines()]
     assert [row["iteration"] for row in rows] == [1, 2, 3, 4]
+
+
+def test_a_kill_while_a_run_is_reopened_keeps_its_records(run, tmp_path, monkeypatch):
+    """Whatever writes the records ends before its last byte; the earlier ones are still there."""
+    killed = tmp_path / "killed"
+    shutil.copytree(run.path, killed)
+    before = (killed / "metrics.jsonl").read_bytes()
+    assert len(before.splitlines()) == 4
+
+    def cut(file, content, *given, **named):
+        file.open("w").close()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "write_text", cut)
+    monkeypatch.setattr(Path, "write_bytes", cut)
+    with pytest.raises(KeyboardInterrupt):
+        resume(killed, Processes(), CPU)
+    assert (killed / "metrics.jsonl").read_bytes() == before
 
 
 @pytest.mark.parametrize("name", [*PRESETS, "normalised"])

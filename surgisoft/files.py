@@ -53,15 +53,21 @@ def note_written(path: Path) -> None:
 def new_file(path: str | Path, noted: bool = True) -> Iterator[Path]:
     """A temporary path to write to; it becomes `path` when the block ends without an exception.
 
-    The temporary name keeps the suffix, and `path`'s folder is made where it is missing. noted:
-    whether `noted_writes` lists it, as all but caches should be.
+    The temporary name keeps the suffix, and `path`'s folder is made where it is missing. Where
+    `path` is a symbolic link, the file to which it leads is written, and the link stays. noted:
+    whether `noted_writes` lists it, as all but caches should be. Raises InputError for a device or
+    a pipe, which a new file would replace; an OSError names `path` or another file.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fresh = _beside(path)
+    target = resolved(path)
+    if target.exists() and not target.is_file() and not target.is_dir():
+        raise InputError(f"{path}: is a device or a pipe, expected a file to write")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    fresh = _beside(target.parent / path.name)
     try:
-        yield fresh
-        os.replace(fresh, path)
+        with _named(path, fresh):
+            yield fresh
+            os.replace(fresh, target)
         if noted:
             note_written(path)
     finally:
@@ -73,29 +79,47 @@ def new_folder(folder: str | Path, own: Sequence[str] = ()) -> Iterator[Path]:
     """A temporary folder to fill; it becomes `folder` when the block ends without an exception.
 
     Where `folder` exists, the new one replaces it. Old files that the new folder does not have are
-    copied to it, except those named in `own`, which belong to the old version.
+    copied to it, except those named in `own`, which belong to the old version. An OSError names
+    `folder`, a file in it or another file.
     """
     given, folder = Path(folder), resolved(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     fresh = _beside(folder)
     fresh.mkdir()
     try:
-        yield fresh
-        if not folder.exists():
+        with _named(given, fresh):
+            yield fresh
+            if not folder.exists():
+                os.replace(fresh, folder)
+                note_written(given)
+                return
+            for kept in folder.iterdir():
+                if kept.name not in own and not (fresh / kept.name).exists():
+                    copy = shutil.copytree if kept.is_dir() else shutil.copy2
+                    copy(kept, fresh / kept.name)
+            old = _beside(folder)
+            os.replace(folder, old)
             os.replace(fresh, folder)
             note_written(given)
-            return
-        for kept in folder.iterdir():
-            if kept.name not in own and not (fresh / kept.name).exists():
-                copy = shutil.copytree if kept.is_dir() else shutil.copy2
-                copy(kept, fresh / kept.name)
-        old = _beside(folder)
-        os.replace(folder, old)
-        os.replace(fresh, folder)
-        note_written(given)
-        shutil.rmtree(old)
+            shutil.rmtree(old)
     finally:
         shutil.rmtree(fresh, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _named(path: Path, fresh: Path) -> Iterator[None]:
+    """Let an OSError name the user's path in place of the temporary one, or of none.
+
+    A failed write, such as on a full disk, names no file.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None and error.errno is not None:
+            error.filename = str(path)
+        elif str(error.filename).startswith(str(fresh)):
+            error.filename = str(path) + str(error.filename).removeprefix(str(fresh))
+        raise
 
 
 def resolved(path: str | Path) -> Path:

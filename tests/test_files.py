@@ -1,8 +1,10 @@
 """Files appear whole or not at all, with the permissions that the umask gives."""
 
+import errno
 import json
 import math
 import os
+import re
 import stat
 
 import numpy as np
@@ -91,6 +93,54 @@ def test_a_link_to_a_folder_stays_a_link(tmp_path):
         (fresh / "a").write_text("a")
     assert (tmp_path / "link").is_symlink()
     assert (tmp_path / "there" / "a").read_text() == "a"
+
+
+def test_a_link_to_a_file_stays_a_link(tmp_path):
+    """The temporary file has the suffix of the link: writers choose their format by it."""
+    (tmp_path / "store").mkdir()
+    (tmp_path / "store" / "7f3a").write_text("old")
+    for name, stored in (("a.csv", "7f3a"), ("new.csv", "not/there/yet")):
+        link = tmp_path / name
+        link.symlink_to(tmp_path / "store" / stored)
+        with new_file(link) as fresh:
+            assert fresh.suffix == ".csv"
+            fresh.write_text("new")
+        assert link.is_symlink()
+        assert (tmp_path / "store" / stored).read_text() == "new"
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["a.csv", "new.csv", "store"]
+    (tmp_path / "round").symlink_to(tmp_path / "round")
+    with pytest.raises(OSError, match="symbolic links"):
+        write_atomically(tmp_path / "round", "x")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes in folders here")
+def test_a_pipe_is_not_replaced_by_a_file(tmp_path):
+    os.mkfifo(tmp_path / "a.json")
+    with pytest.raises(InputError, match=r"a\.json: is a device or a pipe, expected a file"):
+        write_json(tmp_path / "a.json", {})
+    assert stat.S_ISFIFO((tmp_path / "a.json").stat().st_mode)
+    assert [item.name for item in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_a_failed_write_names_what_the_user_named(tmp_path):
+    """A full disk names no file, and a folder that is being filled has a temporary name."""
+
+    def full(where, inside):
+        with where as fresh:
+            (fresh / inside).write_text("") if inside else None
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    for where, inside, named in (
+        (new_file(tmp_path / "a.txt"), "", "a.txt"),
+        (new_folder(tmp_path / "b"), "weights", "b"),
+        (new_folder(tmp_path / "b"), "missing/weights", "b/missing/weights"),
+    ):
+        with pytest.raises(OSError, match=re.escape(f"'{tmp_path / named}'")) as caught:
+            full(where, inside)
+        assert caught.value.filename == str(tmp_path / named)
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(OSError, match="words alone"), new_file(tmp_path / "a.txt"):
+        raise OSError("words alone")
 
 
 def test_json_has_null_for_numbers_that_are_not_finite(tmp_path):

@@ -15,7 +15,7 @@ from torch import Tensor
 from surgisoft import __version__
 from surgisoft.config import Where, describe, from_table
 from surgisoft.errors import InputError, unknown_name
-from surgisoft.files import new_folder, read_json
+from surgisoft.files import new_folder, read_json, resolved
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.callables.arm import arm_by_itself
 from surgisoft.surrogate.callables.named import (
@@ -122,15 +122,17 @@ def claim_folder(folder: str | Path, force: bool = False) -> Path:
     model.
     """
     folder = Path(folder)
-    above = next(parent for parent in folder.absolute().parents if parent.exists())
+    above = next(parent for parent in resolved(folder).parents if parent.exists())
     if not above.is_dir() or not os.access(above, os.W_OK):
         raise InputError(f"{folder}: cannot be written, {above} is not a writable folder")
-    if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not force):
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file, expected a folder; choose another name")
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / "config.json").is_file():
+        raise InputError(f"{folder}: holds files that are not a model; choose another name")
+    if folder.is_dir() and any(folder.iterdir()) and not force:
         raise InputError(
             f"{folder}: already exists; choose another name or pass --force (in Python force=True)"
         )
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / "config.json").is_file():
-        raise InputError(f"{folder}: holds files that are not a model; choose another name")
     return folder
 
 
@@ -144,7 +146,8 @@ def save_model(
     """Write a model to a folder, completely or not at all.
 
     report: JSON-able, stored beside the model; known: training residuals to store (default: those
-    of the model). Raises InputError where the folder cannot be written (`claim_folder`).
+    of the model). Raises InputError where the folder cannot be written (`claim_folder`, or a full
+    disk).
     """
     known = model.training_residuals if known is None else known
     folder = claim_folder(folder, force)
@@ -165,15 +168,18 @@ def save_model(
         config["jump_mm"] = model.validation.jump_mm
     if model.fitted_rows is not None:
         config["fitted_rows"] = model.fitted_rows.to_json()
-    with new_folder(folder, OWN_FILES) as fresh:
-        weights = {name: value.contiguous().cpu() for name, value in model.state_dict().items()}
-        # Not by `save_file`, which makes a file that only its owner can read.
-        (fresh / "weights.safetensors").write_bytes(safetensors_bytes(weights))
-        (fresh / "config.json").write_text(json.dumps(config, indent=2) + "\n")
-        if report is not None:
-            (fresh / "report.json").write_text(json.dumps(report, indent=2) + "\n")
-        if known is not None:
-            known.save(fresh)
+    try:
+        with new_folder(folder, OWN_FILES) as fresh:
+            weights = {name: value.contiguous().cpu() for name, value in model.state_dict().items()}
+            # Not by `save_file`, which makes a file that only its owner can read.
+            (fresh / "weights.safetensors").write_bytes(safetensors_bytes(weights))
+            (fresh / "config.json").write_text(json.dumps(config, indent=2) + "\n")
+            if report is not None:
+                (fresh / "report.json").write_text(json.dumps(report, indent=2) + "\n")
+            if known is not None:
+                known.save(fresh)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror or error})") from error
 
 
 def _place(folder: str | Path) -> Path:

@@ -1,14 +1,23 @@
 """A model's folder: who may read it, and what comes back from it."""
 
+import errno
 import json
 import os
+import re
 import stat
+from pathlib import Path
 
 import pytest
 import torch
 
 from surgisoft.errors import InputError
-from surgisoft.surrogate.checkpoint import OWN_FILES, default_arm, load_model, save_model
+from surgisoft.surrogate.checkpoint import (
+    OWN_FILES,
+    claim_folder,
+    default_arm,
+    load_model,
+    save_model,
+)
 from surgisoft.surrogate.interval import ErrorInterval
 from surgisoft.surrogate.model import Validation
 
@@ -54,3 +63,42 @@ def test_a_shape_at_rest_of_other_key_points_is_refused(tmp_path):
     file.write_text(json.dumps(config))
     with pytest.raises(InputError, match=r"4 key points by config.json, 'rest_mm' has shape \[5"):
         load_model(tmp_path / "arm")
+
+
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (Path.touch, "is a file, expected a folder; choose another name"),
+        (Path.mkdir, "holds files that are not a model; choose another name"),
+    ],
+)
+def test_force_is_recommended_only_where_it_helps(make, message, force, tmp_path):
+    make(tmp_path / "a")
+    if (tmp_path / "a").is_dir():
+        (tmp_path / "a" / "letter.txt").touch()
+    with pytest.raises(InputError, match=f"{re.escape(str(tmp_path / 'a'))}: {message}$"):
+        claim_folder(tmp_path / "a", force)
+
+
+def test_a_link_into_a_place_that_cannot_be_made_is_told_at_once(tmp_path):
+    (tmp_path / "file").touch()
+    (tmp_path / "link").symlink_to(tmp_path / "file" / "arm")
+    with pytest.raises(InputError, match=r"link: cannot be written, .*file is not a writable"):
+        claim_folder(tmp_path / "link")
+
+
+def test_a_full_disk_names_the_folder_and_keeps_the_old_model(tmp_path, monkeypatch):
+    folder = tmp_path / "arm"
+    save_model(default_arm(), folder)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+
+    def full(*given, **named):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    said = re.escape(f"{folder}: cannot be written (No space left on device)")
+    with pytest.raises(InputError, match=f"^{said}$"):
+        save_model(default_arm(), folder, force=True)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert [path.name for path in tmp_path.iterdir()] == ["arm"]

@@ -14,12 +14,13 @@ import signal
 import threading
 import time
 from collections.abc import Callable
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
+from rsl_rl.algorithms import PPO
 from torch import Tensor
 
 from surgisoft.agents.actor import ScaledActor
@@ -139,14 +140,32 @@ class Training:
         self.seen, gathered = self._rolled_out(self.seen)
         losses = {}
         for agent, ppo in self.agents.items():
-            for name, value in update(ppo).items():
-                losses[f"{agent}/{name}"] = value
+            try:
+                found = update(ppo)
+            except RuntimeError as error:  # of a draw from a distribution that is NaN
+                if _finite(ppo):
+                    raise
+                raise self._diverged(agent) from error
+            losses |= {f"{agent}/{name}": value for name, value in found.items()}
+        bad = [agent for agent, ppo in self.agents.items() if not _finite(ppo)]
+        if self.processes.any(bool(bad)):
+            raise self._diverged(", ".join(bad or self.agents))
         self.iteration += 1
         self.clock.tick()
         self.share = self._shared()
         first = next(iter(self.agents.values()))
         noise = first.get_policy().distribution.log_std_param.detach().exp().mean().item()
         return Iteration(gathered, losses, first.learning_rate, noise)
+
+    def _diverged(self, agents: str) -> InputError:
+        """The error where weights are not finite: nothing is learned any more."""
+        preset = self.plan.preset
+        steps = (self.iteration + 1) * preset.envs * preset.rollout * self.processes.count
+        return InputError(
+            f"the training diverged: after {steps:,} steps the weights of {agents} are NaN or "
+            f"infinite; train again with a smaller ppo.learning_rate (now {preset.learning_rate:g})"
+            " or smaller weights of the rewards"
+        )
 
     def policies(self) -> dict[str, dict[str, Tensor]]:
         """agent -> weights of its actor, copied."""
@@ -222,6 +241,13 @@ class Training:
         self.iteration, self.best = int(saved["iteration"]), _evaluation(saved["best"])
         self.clock = Clock(float(saved["wall_s"]), float(saved["cpu_s"]))
         self.share = self._shared()
+
+
+def _finite(ppo: PPO) -> bool:
+    """Whether all weights of an agent's actor and critic are finite."""
+    networks = (ppo.get_policy(), ppo.critic)
+    found = [each.detach().isfinite().all() for net in networks for each in net.parameters()]
+    return bool(torch.stack(found).all())
 
 
 def _evaluation(saved: Any) -> dict[str, float] | None:
@@ -337,7 +363,7 @@ def _continue(run, processes, device, report, logger: str) -> Result:
     log = _Log(run, training.iteration, logger) if processes.leads else None
     written, found = time.monotonic(), training.best
     stopped = reached = False
-    with _asked_to_stop() as asked:
+    with _asked_to_stop() as asked, closing(log) if log else nullcontext():
         while training.share < 1.0 and not (stopped or reached):
             before = training.clock.wall_s
             turn = training.iterate()
@@ -355,8 +381,6 @@ def _continue(run, processes, device, report, logger: str) -> Result:
             if ends or stopped or reached or late or row:
                 _save_last(run, training)
                 written = time.monotonic()
-    if log:
-        log.close()
     clock = training.clock
     done = reached or training.share >= 1.0
     return Result(done, training.steps, clock.wall_s, clock.cpu_s, training.best)

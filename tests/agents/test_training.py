@@ -784,3 +784,34 @@ def test_compiled_networks_learn_at_the_rates_of_plain_layers(monkeypatch):
     assert len(set(found[0][0])) > 1
     for one, other in zip(found[0][1], found[1][1], strict=True):
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("last_noise", [0.005, None], ids=["scheduled noise", "learned noise"])
+def test_a_training_that_diverges_ends_and_keeps_its_last_checkpoint(last_noise, tmp_path):
+    """The fourth update is made with a rate by which weights are NaN after it."""
+    plan = plan_of(preset=replace(TINY, desired_kl=None, last_noise=last_noise))
+    folder = tmp_path / "run"
+
+    def leap(progress):
+        if progress.steps == 3 * TINY.envs * TINY.rollout:
+            for ppo in learning:
+                ppo.learning_rate = 1e38
+                ppo.optimizer.param_groups[0]["lr"] = 1e38
+
+    learning = []
+    with pytest.MonkeyPatch.context() as patch:
+        make = training.make_ppo
+
+        def kept(*given):
+            agents = make(*given)
+            learning.extend(agents.values())
+            return agents
+
+        patch.setattr(training, "make_ppo", kept)
+        with pytest.raises(
+            InputError, match="diverged: after 256 steps the weights of arm"
+        ):
+            train_new(folder, plan, Processes(), CPU, leap)
+    assert RunFolder(folder).load(LAST)["iteration"] == 2
+    assert all(value.isfinite().all() for value in weights(RunFolder(folder)).values())
+    assert len((folder / "metrics.jsonl").read_text().splitlines()) == 3

@@ -66,10 +66,14 @@ class TrainingRequest:
         envs = self.envs
         if envs is None and self.steps is not None:
             envs = envs_for(self.preset, self.task, self.steps)
-        numbers = preset_for(self.preset, self.task, envs=envs, compile=self.compile or None)
+        given = {"envs": envs, "compile": self.compile or None}
         if self.ppo:
-            changed = merged(to_table(numbers), self.ppo)
+            known = {name: value for name, value in given.items() if value is not None}
+            usual = to_table(preset_for(self.preset, self.task)) | known
+            changed = merged(usual, self.ppo)
             numbers = from_table(Preset, changed, Where(COMMAND_LINE, keys=("ppo",)))
+        else:
+            numbers = preset_for(self.preset, self.task, **given)
         config = config_for(self.preset, config)
         if self.changes:
             config = changed_config(config, self.changes, COMMAND_LINE)

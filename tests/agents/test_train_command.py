@@ -11,7 +11,9 @@ import pytest
 import torch
 
 from surgisoft.agents.run_folder import LAST, RunFolder
+from surgisoft.agents.training_request import TrainingRequest
 from surgisoft.cli import run as surgisoft
+from surgisoft.errors import InputError
 from surgisoft.replay.show import find_replay
 from surgisoft.tasks.episodes.file import load_episode
 
@@ -126,3 +128,12 @@ def test_a_logger_that_cannot_be_opened_leaves_nothing(tmp_path, capsys, monkeyp
     said = capsys.readouterr().err.splitlines()
     assert said == ["surgisoft: error: --logger mlflow: cannot be opened: no server at localhost"]
     assert not folder.exists()
+
+
+def test_hyper_parameters_count_together_with_the_episodes():
+    """Two episodes of 12 steps are too few for the 16 minibatches of the task, not for two."""
+    plan = TrainingRequest("track_circle", envs=2, ppo={"batches": 2}).plan()
+    assert (plan.preset.envs, plan.preset.batches, plan.preset.rollout) == (2, 2, 12)
+    assert TrainingRequest("track_circle", envs=2, ppo={"envs": 64}).plan().preset.envs == 64
+    with pytest.raises(InputError, match="2 envs x 12 steps in 13 minibatches"):
+        TrainingRequest("track_circle", envs=2, ppo={"batches": 13}).plan()

@@ -808,9 +808,7 @@ def test_a_training_that_diverges_ends_and_keeps_its_last_checkpoint(last_noise,
             return agents
 
         patch.setattr(training, "make_ppo", kept)
-        with pytest.raises(
-            InputError, match="diverged: after 256 steps the weights of arm"
-        ):
+        with pytest.raises(InputError, match="diverged: after 256 steps the weights of arm"):
             train_new(folder, plan, Processes(), CPU, leap)
     assert RunFolder(folder).load(LAST)["iteration"] == 2
     assert all(value.isfinite().all() for value in weights(RunFolder(folder)).values())

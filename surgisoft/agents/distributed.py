@@ -13,7 +13,14 @@ from dataclasses import dataclass
 import torch
 import torch.distributed as dist
 
+from surgisoft.errors import InputError
+from surgisoft.graphs import reason_of
 from surgisoft.tasks.arguments import device_of
+
+BY_TORCHRUN = (
+    "start several processes by torchrun (docs/training.md), and leave WORLD_SIZE unset otherwise"
+)
+"""What to do where the processes do not find each other."""
 
 
 @dataclass(frozen=True)
@@ -74,19 +81,45 @@ def _device() -> torch.device:
     return torch.device("cuda", torch.cuda.current_device()) if nccl else torch.device("cpu")
 
 
+def process_count() -> int:
+    """Number of processes that torchrun started together: `WORLD_SIZE`; 1 without torchrun."""
+    return _number("WORLD_SIZE", 1)
+
+
+def _number(name: str, otherwise: int) -> int:
+    """A whole number of the environment that torchrun sets; raises InputError for anything else."""
+    given = os.environ.get(name, str(otherwise))
+    if not given.isascii() or not given.isdigit():
+        raise InputError(f"{name} is '{given}', expected a whole number; {BY_TORCHRUN}")
+    return int(given)
+
+
 @contextlib.contextmanager
 def processes(device: str) -> Iterator[tuple[Processes, torch.device]]:
-    """Rank and device of this process among those that torchrun started."""
-    kind = device_of(device, "--device")
-    count = int(os.environ.get("WORLD_SIZE", "1"))
-    if count == 1:
+    """Rank and device of this process among those that torchrun started.
+
+    Raises InputError where the environment is not torchrun's, and for more processes than GPUs.
+    """
+    kind, count = device_of(device, "--device"), process_count()
+    if count <= 1:
         yield Processes(), kind
         return
-    local = int(os.environ.get("LOCAL_RANK", "0"))
+    local = _number("LOCAL_RANK", 0)
     if kind.type == "cuda":
+        if local >= (most := torch.cuda.device_count()):
+            raise InputError(
+                f"process {local + 1} of this machine has no GPU of its own: PyTorch finds {most}; "
+                f"start at most {most} (torchrun --nproc-per-node {most})"
+            )
         kind = torch.device("cuda", local)
         torch.cuda.set_device(kind)
-    dist.init_process_group("nccl" if kind.type == "cuda" else "gloo")
+    try:
+        dist.init_process_group("nccl" if kind.type == "cuda" else "gloo")
+    except (ValueError, RuntimeError) as error:
+        raise InputError(
+            f"WORLD_SIZE is {count}, but the processes do not find each other "
+            f"({reason_of(error)}); {BY_TORCHRUN}"
+        ) from error
     try:
         yield Processes(dist.get_rank(), count, local), kind
     finally:

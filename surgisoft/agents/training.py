@@ -314,7 +314,8 @@ def train_new(
     try:
         return _continue(RunFolder(folder), processes, device, report, logger)
     except (LoggerFailed, CompileFailed):  # before an update: nothing is lost with the folder
-        shutil.rmtree(folder)
+        if processes.leads:
+            shutil.rmtree(folder)
         raise
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from surgisoft.agents.compiled_update import check_compiler
-from surgisoft.agents.distributed import processes
+from surgisoft.agents.distributed import process_count, processes
 from surgisoft.agents.loggers import TENSORBOARD, check_logger
 from surgisoft.agents.presets import Plan, Preset, config_for, envs_for, preset_for, steps_for
 from surgisoft.agents.run_folder import RunFolder, check_free, default_folder
@@ -192,7 +192,7 @@ def shortfall(run: TrainedRun) -> str:
 
 def _new_folder(task: str, output: str | Path | None) -> Path:
     """The folder of a new run; several processes cannot each name it by the time."""
-    if output is None and int(os.environ.get("WORLD_SIZE", "1")) > 1:
+    if output is None and process_count() > 1:
         raise InputError("several processes need one folder: name it with -o RUN")
     folder = Path(output) if output else default_folder(task)
     if os.environ.get("RANK", "0") == "0":

@@ -115,6 +115,38 @@ def test_several_processes_need_a_named_folder(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["full"]
 
 
+@pytest.mark.parametrize(
+    ("variables", "gpus", "message"),
+    [
+        ({"WORLD_SIZE": "two"}, 0, "^WORLD_SIZE is 'two', expected a whole number; start several"),
+        (
+            {"WORLD_SIZE": "2"},
+            0,
+            "^WORLD_SIZE is 2, but the processes do not find each other .*RANK",
+        ),
+        ({"WORLD_SIZE": "2", "LOCAL_RANK": "x"}, 0, "^LOCAL_RANK is 'x', expected a whole number"),
+        (
+            {"WORLD_SIZE": "3", "LOCAL_RANK": "2"},
+            2,
+            "^process 3 of this machine has no GPU .*finds 2",
+        ),
+    ],
+)
+def test_processes_that_torchrun_did_not_start_are_one_line(
+    variables, gpus, message, tmp_path, monkeypatch
+):
+    for name in ("RANK", "LOCAL_RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpus > 0)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
+    with pytest.raises(InputError, match=message) as error:
+        train("track_circle", tmp_path / "run", steps=100, device="cuda" if gpus else "cpu")
+    assert "\n" not in str(error.value)
+    assert not list(tmp_path.iterdir())
+
+
 def test_damaged_runs_are_refused(packaged, tmp_path):
     copy = tmp_path / "run"
     shutil.copytree(packaged, copy)

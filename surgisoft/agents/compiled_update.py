@@ -24,7 +24,7 @@ from surgisoft.tasks.world.world import World
 
 
 class CompileFailed(InputError):
-    """`torch.compile` did not build the first minibatch; nothing was learned before."""
+    """`torch.compile` did not build the first minibatch or step; nothing was learned before."""
 
 
 COMPILERS = ("g++", "clang++", "c++")
@@ -68,14 +68,18 @@ def compiled_update(ppo: PPO) -> Callable[[], dict[str, float]]:
         except Exception as error:
             if built:
                 raise
-            cause = getattr(error, "inner_exception", error)
-            raise CompileFailed(
-                f"--compile: torch.compile fails here: {reason_of(cause)}; leave the option out"
-            ) from error
+            raise _not_built(error) from error
         built = True
         return found
 
     return lambda: _update(ppo, losses)
+
+
+def _not_built(error: Exception) -> CompileFailed:
+    cause = getattr(error, "inner_exception", error)
+    return CompileFailed(
+        f"--compile: torch.compile fails here: {reason_of(cause)}; leave the option out"
+    )
 
 
 def compile_arms(world: World, count: int) -> None:
@@ -83,17 +87,28 @@ def compile_arms(world: World, count: int) -> None:
 
     For devices where an arm is tensor operations: on a CPU its loops are compiled already. Other
     batches, such as those of an evaluation, are stepped as before. No CUDA graph is made of it,
-    because the next replay would write over the state that it returned.
+    because the next replay would write over the state that it returned. The first such step raises
+    `CompileFailed` where it cannot be compiled.
     """
     for arm in world.arms.values():
         arm.step = _by_rows(arm.step, count)  # type: ignore[method-assign]  # of this arm alone
 
 
 def _by_rows(plain: Callable[..., Any], count: int) -> Callable[..., Any]:
-    fast = torch.compile(plain, dynamic=False)
+    fast, built = torch.compile(plain, dynamic=False), False
 
     def step(stream: Any, part: Any, action: Tensor, dt_s: float) -> Any:
-        return (fast if len(action) == count else plain)(stream, part, action, dt_s)
+        nonlocal built
+        if len(action) != count:
+            return plain(stream, part, action, dt_s)
+        try:
+            found = fast(stream, part, action, dt_s)
+        except Exception as error:
+            if built:
+                raise
+            raise _not_built(error) from error
+        built = True
+        return found
 
     return step
 

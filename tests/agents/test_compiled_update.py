@@ -198,3 +198,22 @@ def test_a_compilation_that_fails_is_one_line_and_leaves_no_run(tmp_path, monkey
         train_new(tmp_path / "run", plan, Processes(), torch.device("cpu"))
     assert len(str(error.value).splitlines()) == 1
     assert not (tmp_path / "run").exists()
+
+
+def test_arms_that_cannot_be_compiled_are_told_at_their_first_step(monkeypatch):
+    """As on a GPU without a C compiler, which Triton needs; other batches are stepped as before."""
+
+    def fails(graph, given):
+        raise RuntimeError("Failed to find C compiler.\nPlease specify via CC")
+
+    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=fails))
+    task = make_task("track_circle")
+    task.world.arms = {name: arm.reference() for name, arm in task.world.arms.items()}
+    compile_arms(task.world, 6)
+    episodes = Episodes(task)
+    with torch.inference_mode():
+        few, many = (episodes.seeded(0, count) for count in (5, 6))
+        assert not episodes.step(few, {"arm": torch.zeros(5, 3)})[1].done.any()
+        with pytest.raises(CompileFailed, match="Failed to find C compiler") as error:
+            episodes.step(many, {"arm": torch.zeros(6, 3)})
+    assert len(str(error.value).splitlines()) == 1

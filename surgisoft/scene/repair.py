@@ -346,10 +346,13 @@ def _close_holes(vertices, faces, what, log):
     part_of = np.zeros(len(vertices), dtype=np.int64)
     part_of[faces.reshape(-1)] = np.repeat(label, 3)
     following = len(vertices)
+    sizes: dict[int, float] = {}
     for loop in loops:
-        rim = vertices[loop]
-        body = vertices[used_indices(faces[label == part_of[loop[0]]])[0]]
-        width, size = np.ptp(rim, axis=0).max(), np.ptp(body, axis=0).max()
+        rim, part = vertices[loop], int(part_of[loop[0]])
+        if part not in sizes:
+            body = vertices[used_indices(faces[label == part])[0]]
+            sizes[part] = np.ptp(body, axis=0).max()
+        width, size = np.ptp(rim, axis=0).max(), sizes[part]
         if width > HOLE * size:
             raise InputError(
                 f"{what}: a hole {width:.3g} mm wide in a surface of {size:.3g} mm is too large "

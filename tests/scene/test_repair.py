@@ -9,6 +9,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from surgisoft.errors import InputError
+from surgisoft.scene.mesh import used_indices
 from surgisoft.scene.meshio import read_parts
 from surgisoft.scene.repair import repair
 from tests.scene.shapes import ball, lumpy
@@ -81,6 +82,29 @@ def test_small_holes_are_closed():
     np.testing.assert_allclose(added.mean(axis=1)[where], removed.mean(axis=1)[order], atol=1e-9)
     widths = np.ptp(removed, axis=1).max(axis=1)
     np.testing.assert_allclose(repaired.holes_mm[0][closed][where], widths[order])
+
+
+def test_many_holes_cost_no_look_at_the_whole_body_each(monkeypatch):
+    """Faces without common corners are lost; a scan has thousands of such holes."""
+    lost, taken = [], np.zeros(len(BALL.vertices_mm), dtype=bool)
+    for number, face in enumerate(BALL.faces):
+        if not taken[face].any():
+            lost.append(number)
+            taken[face] = True
+    assert len(lost) > 100
+    looks = []
+
+    def counted(faces):
+        looks.append(len(faces))
+        return used_indices(faces)
+
+    monkeypatch.setattr("surgisoft.scene.repair.used_indices", counted)
+    for some in (lost[:2], lost):
+        looks.append(0)
+        repaired = repair(BALL.vertices_mm, np.delete(BALL.faces, some, axis=0), "ball")
+        assert repaired.bodies[0].volume_mm3 == pytest.approx(BALL.volume_mm3)
+        assert counts(repaired) == {"holes closed": len(some)}
+    assert len(looks) == 2 * looks.index(0, 1), "as many looks for many holes as for two"
 
 
 def test_a_closed_hole_is_known_of_the_body_that_had_it():

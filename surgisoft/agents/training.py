@@ -138,7 +138,7 @@ class Training:
         for ppo in self.agents.values():
             set_noise(ppo, preset, self.share)
         self.seen, gathered = self._rolled_out(self.seen)
-        losses = {}
+        losses: dict[str, float] = {}
         for agent, ppo in self.agents.items():
             try:
                 found = update(ppo)

@@ -21,7 +21,10 @@ GAP_PX = 6
 
 
 def film(log: EpisodeLog, count: int = PICTURES) -> Picture:
-    """Film strip of the endoscope's pictures at `count` moments from the first beam to the end."""
+    """Film strip of the endoscope's pictures at `count` moments from the first beam to the end.
+
+    The end is the last moment at which all arms are finite, which they are not where they failed.
+    """
     from PIL import Image
 
     from surgisoft.replay.endoscope import jpegs
@@ -29,8 +32,10 @@ def film(log: EpisodeLog, count: int = PICTURES) -> Picture:
     if log.camera is None:
         raise InputError("the episode has no endoscope, so it has no pictures")
     on = np.array([], int) if log.burning is None else np.flatnonzero(log.burning)
-    ends = (int(on[0]), int(on[-1])) if len(on) > 1 else (0, log.rows - 1)
-    rows = np.unique(np.append(np.linspace(*ends, count - 1).astype(int), log.rows - 1))
+    finite = np.all([np.isfinite(arm.line_mm).all((1, 2)) for arm in log.arms.values()], axis=0)
+    last = int(np.flatnonzero(finite).max(initial=0))
+    ends = (int(on[0]), int(on[-1])) if len(on) > 1 else (0, last)
+    rows = np.unique(np.append(np.linspace(*ends, count - 1).astype(int), last).clip(max=last))
     frames = [Image.open(io.BytesIO(data)) for data in jpegs(log, next(iter(log.cameras)), rows)]
     side = frames[0].width
     strip = Image.new("RGB", (len(frames) * (side + GAP_PX) - GAP_PX, side), "white")

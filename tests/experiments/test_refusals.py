@@ -1,12 +1,15 @@
 """Experiments that cannot be meant, and rare ways through those that can."""
 
+import io
 import json
 import re
 import shutil
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from surgisoft.agents.run_folder import PACKAGED
 from surgisoft.cli import run
@@ -14,6 +17,7 @@ from surgisoft.config import read_toml
 from surgisoft.errors import InputError
 from surgisoft.experiments.controllers import PhaseControllers, Schedule
 from surgisoft.experiments.phases import PhasedTask, with_phase_events
+from surgisoft.experiments.pictures import film
 from surgisoft.experiments.plan import build_task, rig_config, scene_of, settings
 from surgisoft.experiments.run import jobs, open_results, read_rows, row_file
 from surgisoft.experiments.session import (
@@ -276,3 +280,21 @@ def test_rows_hold_texts_and_numbers(tmp_path, value):
         file.write_text(json.dumps(json.loads(file.read_text()) | {"time_s": value}))
     with pytest.raises(InputError, match="is not the row of episode 0"):
         read_rows(tmp_path, every)
+
+
+def test_a_film_ends_where_the_arms_are_finite(monkeypatch):
+    """Of six seconds the arm is not finite in the last two, of which there is no picture."""
+    log, drawn = made_up(cameras={"arm": object()}), []
+    line_mm = np.zeros((6, 2, 3))
+    line_mm[4:] = np.nan
+    log = replace(log, arms={"arm": replace(log.arms["arm"], line_mm=line_mm)})
+
+    def pictures(log, name, rows):
+        drawn.extend(rows.tolist())
+        file = io.BytesIO()
+        Image.new("RGB", (8, 8)).save(file, "JPEG")
+        return [file.getvalue()] * len(rows)
+
+    monkeypatch.setattr("surgisoft.replay.endoscope.jpegs", pictures)
+    assert film(log, 3).caption == "What the endoscope saw at 0.0, 3.0 s"
+    assert drawn == [0, 3]

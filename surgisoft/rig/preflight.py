@@ -13,6 +13,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from surgisoft.errors import InputError
+from surgisoft.measurement.protocols.continuous import farthest_from_rest
 from surgisoft.rig.collect import mean_sample, samples_in
 from surgisoft.rig.interface import Rig, Sample, vent, vented
 
@@ -25,7 +26,8 @@ class PreflightPlan:
     """How the check moves the arm, and what counts as right."""
 
     share: float = 0.1
-    """Pressure of the chamber that is tried, as a share of its upper limit."""
+    """Pressure of the chamber that is tried, as a share of the way from rest to the end of its
+    range that is farthest from rest."""
     settle_s: float = 1.5
     """Time at a pressure before samples are taken [s]."""
     average_s: float = 0.5
@@ -66,10 +68,10 @@ def preflight(rig: Rig, predict: Predict, plan: PreflightPlan | None = None) -> 
     or key points than the rig.
     """
     plan = plan or PreflightPlan()
-    rest = vented(rig.limits)
+    rest, far = vented(rig.limits), farthest_from_rest(rig.limits)
     commands = np.tile(rest, (rig.chambers + 1, 1))
     for i in range(rig.chambers):
-        commands[i + 1, i] += plan.share * (rig.limits[i, 1] - rest[i])
+        commands[i + 1, i] += plan.share * (far[i] - rest[i])
     predicted = _predicted(rig, predict, commands)
     samples = []
     noise_mm = 0.0

@@ -8,7 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from surgisoft.errors import InputError
-from surgisoft.measurement.protocols import PROTOCOLS, Protocol, load_schedule, make_protocol
+from surgisoft.measurement.protocols import (
+    PROTOCOLS,
+    SIGNALS,
+    Knots,
+    Protocol,
+    load_schedule,
+    make_protocol,
+)
 
 LIMITS = np.tile([-15.0, 54.0], (3, 1))
 LATTICE = -15.0 + 3.0 * np.arange(24)
@@ -146,6 +153,73 @@ def test_every_protocol_scales_and_keeps_the_limits(name, points, seed, chambers
     np.testing.assert_array_equal(again.commands, protocol.commands)
     if name == "grid":
         assert len(np.unique(protocol.commands.round(9), axis=0)) == points
+
+
+RANGES = st.tuples(st.floats(-200.0, 200.0), st.floats(1.0, 30.0)).map(lambda r: (r[0], sum(r)))
+"""Ranges of vacuum (both ends below zero), of pressure that never ends, and of both [kPa]."""
+
+
+@settings(max_examples=8, deadline=None)
+@given(limits=st.lists(RANGES, min_size=1, max_size=3), seed=st.integers(0, 1000))
+def test_every_signal_moves_every_chamber_within_any_range(limits, seed):
+    """25 minutes begin at rest and use at least a fifth of any range; `returns` has two postures
+    only, which may be near rest."""
+    low, high = np.array(limits).T
+    for name, signal in SIGNALS.items():
+        knots = Knots(np.array(limits))
+        signal.draw(knots, 1500.0, np.random.default_rng(seed))
+        times, rows = knots.cut(1500.0)
+        assert times[-1] == 1500.0
+        assert (rows >= low - 1e-9).all()
+        assert (rows <= high + 1e-9).all()
+        least = 0.0 if name == "returns" else 0.2
+        assert (np.ptp(rows, axis=0) > least * (high - low)).all()
+        np.testing.assert_array_equal(rows[0], np.clip(0.0, low, high))
+
+
+@settings(max_examples=8, deadline=None)
+@given(limits=st.lists(RANGES, min_size=1, max_size=3), seed=st.integers(0, 1000))
+def test_every_protocol_moves_every_chamber_within_any_range(limits, seed):
+    low, high = np.array(limits).T
+    for name, entry in PROTOCOLS.items():
+        points = 1000 if entry.steady_state else 24_000
+        commands = make_protocol(name, np.array(limits), points, seed).commands
+        assert (commands >= low - 1e-9).all()
+        assert (commands <= high + 1e-9).all()
+        assert (np.ptp(commands, axis=0) >= 0.2 * (high - low)).all()
+
+
+@pytest.mark.parametrize("name", ["ramps", "two_speeds", "long_holds", "returns", "ladder", "sets"])
+def test_vacuum_mirrors_pressure(name):
+    """An arm of -60 to 0 kPa is driven as one of 0 to 60 kPa is, with the other sign."""
+
+    def rows(limits):
+        knots = Knots(np.array(limits))
+        SIGNALS[name].draw(knots, 300.0, np.random.default_rng(4))
+        return knots.cut(300.0)
+
+    (times, pushed), (same, drawn) = rows([[0.0, 60.0]] * 2), rows([[-60.0, 0.0]] * 2)
+    np.testing.assert_allclose(same, times)
+    np.testing.assert_allclose(drawn, -pushed)
+
+
+@pytest.mark.parametrize("name", ["two_speeds", "long_holds", "ladder"])
+def test_the_farther_end_of_a_range_is_the_one_that_is_used(name):
+    """From -60 to 5 kPa the arm goes far below ambient, from -15 to 54 kPa far above it."""
+    for low, high in ((-60.0, 5.0), (-15.0, 54.0)):
+        knots = Knots(np.array([[low, high]]))
+        SIGNALS[name].draw(knots, 600.0, np.random.default_rng(0))
+        farthest = max(knots.cut(600.0)[1].ravel(), key=abs)
+        assert abs(farthest) > 0.8 * max(-low, high)
+        assert np.sign(farthest) == np.sign(low + high)
+
+
+def test_limits_that_are_no_ranges_get_one_line():
+    for limits in ([[0.0, 0.0]], [[5.0, 1.0]], [[0.0, np.nan]], [0.0, 1.0], np.zeros((0, 2))):
+        with pytest.raises(InputError, match="expected a finite lowest and highest actuation"):
+            make_protocol("walk", limits)
+    with pytest.raises(InputError, match=r"widest range is 0.001 kPa, expected at least 0.1 kPa"):
+        make_protocol("ramps", [[0.0, 1e-3]])
 
 
 def test_ramps_have_their_rates():

@@ -9,7 +9,7 @@ import pytest
 from surgisoft.cli import run
 from surgisoft.errors import InputError
 from surgisoft.rig import VirtualRig
-from surgisoft.rig.preflight import judge, preflight
+from surgisoft.rig.preflight import PreflightPlan, judge, preflight
 from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.reach import steady_key_points
 from tests.rig.own_rig import OwnRig
@@ -95,6 +95,31 @@ def test_it_moves_one_chamber_at_a_time_and_ends_vented(predict):
     assert moved.max() == pytest.approx(4.0), "a tenth of 40 kPa"
     assert (moved > 0.0).any(axis=0).all()
     assert rig.vents == 1
+
+
+class Limited(OwnRig):
+    """A bench whose chambers have other ranges."""
+
+    def __init__(self, limits):
+        super().__init__("x")
+        self.limits = np.array(limits)
+
+
+@pytest.mark.parametrize(
+    ("limits", "tried"),
+    [
+        ([[-15.0, 0.0]] * 3, [-3.0] * 3),
+        ([[-15.0, 5.0], [-5.0, 40.0], [10.0, 50.0]], [-3.0, 8.0, 8.0]),
+    ],
+)
+def test_a_chamber_is_tried_towards_the_farther_end_of_its_range(predict, limits, tried):
+    """Of vacuum, of both with either the larger, and of pressure that never ends."""
+    rig = Limited(limits)
+    found = preflight(rig, predict, PreflightPlan(share=0.2))
+    assert found.faults == ()
+    moved = np.array(rig.commands) - np.clip(0.0, *rig.limits.T)
+    farthest = moved[np.abs(moved).argmax(axis=0), range(3)]
+    np.testing.assert_allclose(farthest, tried)
 
 
 @pytest.mark.parametrize(("noise_mm", "still"), [(0.79, 0), (0.81, 3)])

@@ -83,7 +83,8 @@ def make_protocol(
     """A protocol of the catalogue, or a schedule file by its path.
 
     limits: (m, 2) lowest and highest actuation [kPa]; points: samples (default: the catalogue's);
-    seed: of the random parts; protocols have different random number streams.
+    seed: of the random parts; protocols have different random number streams. Raises InputError for
+    an unknown name, too few points, and limits that are no ranges.
     """
     if str(name).endswith(".csv"):
         if points is not None:
@@ -96,9 +97,21 @@ def make_protocol(
     if points < 10:
         raise InputError(f"--points is {points}, expected at least 10")
     rng = np.random.default_rng([seed, zlib.crc32(str(name).encode())])
-    limits = np.asarray(limits, np.float64)
+    limits = _checked(limits)
     if entry.steady_state:
         commands, run = entry.steady_state(points, limits, rng)
         return Protocol(str(name), "settled", commands, run)
     t_s, commands, run = continuous.schedule(entry.signals, points, PERIOD_S, limits, rng)
     return Protocol(str(name), "continuous", commands, run, t_s)
+
+
+def _checked(limits: np.ndarray) -> np.ndarray:
+    """Limits (m, 2) as float64; raises InputError unless each is a finite lowest and highest."""
+    limits = np.asarray(limits, np.float64)
+    pairs = limits.ndim == 2 and limits.shape[1] == 2 and len(limits) > 0
+    if not (pairs and np.isfinite(limits).all() and (limits[:, 0] < limits[:, 1]).all()):
+        raise InputError(
+            f"limits {limits.tolist()}: expected a finite lowest and highest actuation of each "
+            "chamber, the lowest below the highest"
+        )
+    return limits

@@ -11,24 +11,49 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from surgisoft.errors import InputError
+
 BRISK = 20.0
 """Rate at which a schedule goes to a starting point [kPa/s]."""
 QUICK = 60.0
 """Rate of a step [kPa/s]; the experiment design scales rates to the arm's range."""
+LEAST_RANGE = 0.1
+"""Narrowest range of the chamber with the widest one [kPa]: at the rate of a step it takes 1.7 ms,
+and a movement of less than a millisecond is none."""
 
 
 class Knots:
     """A schedule while it is written; starts at ambient pressure."""
 
     def __init__(self, limits: np.ndarray) -> None:
+        """limits: (m, 2) lowest and highest actuation [kPa].
+
+        Raises InputError where no chamber has a range of `LEAST_RANGE`: no signal would end.
+        """
         self.low, self.high = limits.T
+        widest = float((self.high - self.low).max())
+        if not widest >= LEAST_RANGE:
+            raise InputError(
+                f"limits {limits.tolist()}: the widest range is {widest:g} kPa, expected at least "
+                f"{LEAST_RANGE:g} kPa; are the limits in another unit?"
+            )
+        self.rest = np.clip(np.zeros(len(limits)), self.low, self.high)
+        """(m,) actuation of an arm at rest: the one nearest to zero [kPa]."""
+        self.far = farthest_from_rest(limits)
+        """(m,) end of each chamber's range that is farthest from rest [kPa]."""
+        self.near = np.where(self.far == self.high, self.low, self.high)
+        """(m,) the other end of each chamber's range [kPa]."""
         self.times = [0.0]
-        self.rows = [np.clip(np.zeros(len(limits)), self.low, self.high)]
+        self.rows = [self.rest]
 
     @property
     def now(self) -> float:
         """Time of the last knot [s]."""
         return self.times[-1]
+
+    def out(self, share: np.ndarray) -> np.ndarray:
+        """(m,) actuation at shares (m,) of the way from rest to the farthest end [kPa]."""
+        return self.rest + share * (self.far - self.rest)
 
     def go(self, target: np.ndarray, rate: float) -> None:
         """To a target (m,) [kPa], the farthest chamber at `rate` [kPa/s]."""
@@ -51,6 +76,17 @@ class Knots:
         return np.append(times[inside], seconds), np.vstack([rows[inside], last])
 
 
+def farthest_from_rest(limits: np.ndarray) -> np.ndarray:
+    """(m,) the end of each range in limits (m, 2) that is farthest from rest, same unit.
+
+    Rest is the actuation nearest to zero. The farthest end is the lowest one of a chamber that is
+    driven by vacuum; of two ends that are equally far it is the upper one.
+    """
+    low, high = np.asarray(limits, np.float64).T
+    rest = np.clip(0.0, low, high)
+    return np.where(high - rest >= rest - low, high, low)
+
+
 def _some(rng: np.random.Generator, chambers: int) -> np.ndarray:
     """(m,) 1 for the chambers of a random single, pair or larger set."""
     chosen = np.zeros(chambers)
@@ -63,8 +99,8 @@ def ramps(knots: Knots, seconds: float, rng: np.random.Generator) -> None:
     while knots.now < seconds:
         for rate in rng.permutation([2.0, 4.0, 8.0, 16.0]):
             chosen = _some(rng, len(knots.low))
-            top = rng.uniform(0.4, 1.0) * knots.high
-            bottom = np.where(rng.random() < 0.5, knots.low, 0.0)
+            top = knots.out(np.full(len(chosen), rng.uniform(0.4, 1.0)))
+            bottom = np.where(rng.random() < 0.5, knots.near, knots.rest)
             start = knots.rows[-1]
             knots.go(np.where(chosen > 0, top, start), rate)
             knots.go(np.where(chosen > 0, bottom, start), rate)
@@ -75,7 +111,7 @@ def holds(knots: Knots, seconds: float, rng: np.random.Generator) -> None:
     while knots.now < seconds:
         target = rng.uniform(knots.low, knots.high)
         if rng.random() < 0.3:
-            target = np.zeros_like(target)
+            target = knots.rest
         knots.go(target, BRISK)
         knots.hold(float(np.exp(rng.uniform(np.log(5.0), np.log(40.0)))))
 
@@ -99,9 +135,9 @@ def ladder(knots: Knots, seconds: float, rng: np.random.Generator) -> None:
         rising = np.linspace(0.15, 1.0, 6)
         rate = float(rng.choice([8.0, 16.0]))
         for reach in [*rising, *rising[-2::-1]]:
-            knots.go(chosen * reach * knots.high, rate)
-            knots.go(np.zeros_like(chosen), rate)
-        knots.go(chosen * knots.low, rate)
+            knots.go(knots.out(chosen * reach), rate)
+            knots.go(knots.rest, rate)
+        knots.go(chosen * knots.near, rate)
 
 
 def wander(knots: Knots, seconds: float, rng: np.random.Generator) -> None:
@@ -123,10 +159,10 @@ def two_speeds(knots: Knots, seconds: float, rng: np.random.Generator) -> None:
     """One path at 3, 20 and 60 kPa/s: separates what depends on time from what does not."""
     while knots.now < seconds:
         chosen = _subset(rng, len(knots.low))
-        top = chosen * rng.uniform(0.5, 1.0) * knots.high
+        top = knots.out(chosen * rng.uniform(0.5, 1.0)) - knots.rest
         for rate in rng.permutation([3.0, 20.0, 60.0]):
-            for target in (top, 0.4 * top, 0.8 * top, 0.0 * top):
-                knots.go(target, rate)
+            for share in (1.0, 0.4, 0.8, 0.0):
+                knots.go(knots.rest + share * top, rate)
 
 
 def steps(knots: Knots, seconds: float, rng: np.random.Generator) -> None:
@@ -137,36 +173,36 @@ def steps(knots: Knots, seconds: float, rng: np.random.Generator) -> None:
 
 
 def long_holds(knots: Knots, seconds: float, rng: np.random.Generator) -> None:
-    """A quick step to a high pressure held for 40 s, then 20 s at rest."""
+    """A quick step far from rest held for 40 s, then 20 s at rest."""
     while knots.now < seconds:
         chosen = _subset(rng, len(knots.low))
-        knots.go(chosen * rng.uniform(0.6, 1.0) * knots.high, QUICK)
+        knots.go(knots.out(chosen * rng.uniform(0.6, 1.0)), QUICK)
         knots.hold(40.0)
-        knots.go(np.zeros_like(chosen), QUICK)
+        knots.go(knots.rest, QUICK)
         knots.hold(20.0)
 
 
 def returns(knots: Knots, seconds: float, rng: np.random.Generator) -> None:
     """To the same two postures and back to rest, again and again: shows drift and slow recovery."""
-    postures = [rng.uniform(0.0, 0.9, len(knots.high)) * knots.high for _ in range(2)]
+    postures = [knots.out(rng.uniform(0.0, 0.9, len(knots.far))) for _ in range(2)]
     for posture in itertools.cycle(postures):
         if knots.now >= seconds:
             return
-        for target in (posture, np.zeros_like(posture)):
+        for target in (posture, knots.rest):
             knots.go(target, 20.0)
             knots.hold(4.0)
 
 
 def sets(knots: Knots, seconds: float, rng: np.random.Generator) -> None:
     """Each chamber alone, each pair, all together, up and down in steady sweeps."""
-    m = len(knots.high)
+    m = len(knots.far)
     chosen = [c for c in itertools.product([0.0, 1.0], repeat=m) if any(c)] if m <= 4 else []
     while knots.now < seconds:
         order = rng.permutation(len(chosen)) if chosen else range(8)
         for k in order:
             pick = np.array(chosen[k]) if chosen else _subset(rng, m)
             for level in (1.0, 0.5, 1.0, 0.0):
-                knots.go(pick * level * knots.high, 16.0)
+                knots.go(knots.out(pick * level), 16.0)
                 knots.hold(0.5)
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from surgisoft.cli import app
+from surgisoft.cli.files import check_folder
 from surgisoft.cli.inputs import check_model, warn
 from surgisoft.cli.options import (
     SEED_MAX,
@@ -142,11 +143,16 @@ def collect(
     """Collect a recording on a rig, by default the virtual one."""
     from surgisoft.measurement.recordings import save_recording
 
-    check_new_recording(output, force)
+    if not dry_run:
+        check_new_recording(output, force)
     if preflight and arm is None:
         raise InputError("--preflight: expected the model of this arm too; add --arm MODEL")
     if arm is not None and not preflight:
         raise InputError("--arm names the model of the pre-flight check; add --preflight")
+    if dry_run and preflight:
+        raise InputError(
+            "--dry-run sends nothing, and --preflight moves the arm; expected one of them"
+        )
     effects = _pairs(hidden or [], strength or [])
     mount = {
         "gravity": gravity,
@@ -159,7 +165,7 @@ def collect(
     if dry_run:
         from surgisoft.rig.trial import dry_run as show_commands
 
-        show_commands(protocol, rig, print, **fields)
+        show_commands(protocol, rig, print, hidden=effects, **fields)
         return
     recording = record_on(protocol, rig, output, force, preflight=arm, hidden=effects, **fields)
     save_recording(recording, output, force)
@@ -193,6 +199,7 @@ def record_on(
     What a real rig measures goes to the log beside `output` at once, and stays there where the run
     is interrupted. preflight: an arm model whose motions a real rig has to show first.
     """
+    from surgisoft.measurement.recordings.log import check_log_free
     from surgisoft.rig.registry import SIMULATED, parse_rig
     from surgisoft.rig.trial import collect as collect_recording
 
@@ -200,7 +207,9 @@ def record_on(
     if preflight and simulated:
         raise InputError("--preflight is for real rigs, and this one is simulated")
     log = log_of(output)
-    there = log.exists()
+    if not simulated:
+        check_log_free(log, force)
+    former = _state(log)
     check = checked_by(preflight) if preflight else None
 
     def before(rig: Rig) -> None:
@@ -220,9 +229,17 @@ def record_on(
                 **fields,
             )
     except BaseException:
-        if log.exists() and (force or not there):
+        if _state(log) not in (None, former):
             warn(f"what was measured so far is in {log}, which every command opens as a recording")
         raise
+
+
+def _state(file: Path) -> tuple[int, int, int] | None:
+    """What differs once a file is written anew or replaced; None where there is none."""
+    if not file.exists():
+        return None
+    found = file.stat()
+    return found.st_ino, found.st_mtime_ns, found.st_size
 
 
 def checked_by(model: Path) -> Callable[[Rig], None]:
@@ -281,7 +298,7 @@ def _pairs(given: list[str], strengths: list[float]) -> list:
 
 def check_new_recording(path: Path, force: bool) -> None:
     """Raise InputError before the work starts, where its result could not be written."""
-    if path.suffix not in (".csv", ".parquet"):
-        raise InputError(f"{path}: suffix '{path.suffix}', expected .csv or .parquet")
-    if path.exists() and not force:
-        raise InputError(f"{path}: exists already; choose another name or use --force")
+    from surgisoft.measurement.recordings import check_writable
+
+    check_writable(path, force)
+    check_folder(path.absolute().parent)

@@ -114,7 +114,7 @@ def show_commands(rig: SafeRig, protocol: Protocol) -> None:
 
 
 def check_fits(rig: Rig, protocol: Protocol) -> None:
-    """Raise an InputError unless the rig can run the protocol."""
+    """Raise an InputError unless the rig can run the protocol, with a sample in every run."""
     if protocol.chambers != rig.chambers:
         raise InputError(
             f"protocol '{protocol.name}' commands {protocol.chambers} chambers, "
@@ -132,6 +132,12 @@ def check_fits(rig: Rig, protocol: Protocol) -> None:
             f"protocol '{protocol.name}': row {row + 1} commands {protocol.commands[row].tolist()} "
             f"{rig.unit}, outside the rig's limits {low.min():g} to {high.max():g} {rig.unit}"
         )
+    for run, commands in runs_of(protocol, rig.period_s):
+        if not len(commands):
+            raise InputError(
+                f"protocol '{protocol.name}': run {run} is too short for a sample of the rig, "
+                f"which measures every {rig.period_s:g} s; make it longer or leave it out"
+            )
 
 
 def runs_of(protocol: Protocol, period_s: float) -> Iterator[tuple[int, np.ndarray]]:

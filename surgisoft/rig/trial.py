@@ -111,13 +111,15 @@ def dry_run(
     seed: int | None = None,
     trial: int = 0,
     points: int | None = None,
+    hidden: Iterable[str | tuple[str, float]] = (),
     **mount: Any,
 ) -> None:
     """Show each command that `collect` would send to a real rig; nothing is sent.
 
-    show: is called with each command in words. Other arguments: as for `collect`.
+    show: is called with each command in words. Other arguments: as for `collect`; a real rig has no
+    hidden effects, and refuses them here, too.
     """
-    bench, plan = _opened(protocol, rig, seed, trial, points, (), mount)
+    bench, plan = _opened(protocol, rig, seed, trial, points, tuple(hidden), mount)
     with guarded(bench) as driven:
         if not isinstance(driven, SafeRig):
             raise InputError("a dry run is for real rigs, and this one is simulated")

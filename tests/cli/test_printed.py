@@ -484,6 +484,7 @@ REFUSED = {
     "next-experiment default -o {dir}/full.csv": "full.csv: exists already; choose another name",
     "collect walk --preflight -o {dir}/a.csv": "expected the model of this arm too; add --arm",
     "collect walk --arm default -o {dir}/a.csv": "--arm names the model of the pre-flight check",
+    "collect walk --preflight --arm default --dry-run -o {dir}/a.csv": "--dry-run sends nothing",
     "collect walk --dry-run -o {dir}/a.csv": "a dry run is for real rigs, and this one is sim",
     "collect walk --hidden creep:2 --strength 1 -o {dir}/a.csv": "both give amplitudes; use one",
     "collect walk --hidden creep leak --strength 1 -o {dir}/a.csv": "2 --hidden and 1 --strength",
@@ -769,6 +770,21 @@ def test_an_interrupted_recording_says_where_its_log_is(tmp_path, capsys, monkey
     error = capsys.readouterr().err
     (log,) = tmp_path.iterdir()
     assert f"what was measured so far is in {log}, which every command opens as a" in error
+
+
+@pytest.mark.parametrize("rig", ["virtual", "tests.rig.own_rig:OwnRig:port=x"])
+def test_an_older_log_is_not_what_was_measured(tmp_path, capsys, rig):
+    """The protocol is refused before anything is written to the log, which stays as it was."""
+    log = tmp_path / "new.log.jsonl"
+    log.write_text("older")
+    plan = tmp_path / "plan.csv"
+    plan.write_text("t_s,c1_kPa\n0,0\n1,1\n")
+    new = str(tmp_path / "new.parquet")
+    assert run(["collect", str(plan), "--rig", rig, "-o", new, "--force"]) == 2
+    error = capsys.readouterr().err
+    assert "commands 1 chambers, the rig has 3" in error
+    assert "measured so far" not in error
+    assert log.read_text() == "older"
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,9 @@ from surgisoft.cli import run
 from surgisoft.measurement.recordings import load_recording
 from surgisoft.rig.hidden import HIDDEN
 
+OWN = "tests.rig.own_rig:OwnRig"
+"""A real rig of three chambers."""
+
 
 def test_collects_writes_and_prints_one_line(tmp_path, capsys):
     out = tmp_path / "r.csv"
@@ -89,6 +92,73 @@ def test_refuses_to_overwrite_and_unknown_suffixes_before_working(tmp_path, caps
     assert out.read_text() == "mine"
     assert run(["collect", "grid", "-o", str(tmp_path / "r.xlsx")]) == 2
     assert "expected .csv or .parquet" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("force", [[], ["--force"]])
+@pytest.mark.parametrize(
+    ("folders", "files", "output", "says"),
+    [
+        (["r.csv"], [], "r.csv", "r.csv: is a folder, expected the name of a file"),
+        (["r.toml"], [], "r.csv", "r.toml: is a folder, expected the name of a file"),
+        ([], ["a"], "a/b/r.csv", "b: cannot be written"),
+        (["r.log.jsonl"], [], "r.csv", "r.log.jsonl: is a folder, expected the name of a new log"),
+    ],
+)
+def test_what_is_in_the_way_is_refused_before_the_rig_moves(
+    tmp_path, capsys, monkeypatch, force, folders, files, output, says
+):
+    def moved(*_, **__):
+        raise AssertionError("the rig was driven")
+
+    monkeypatch.setattr("surgisoft.rig.trial.collect", moved)
+    for name in folders:
+        (tmp_path / name).mkdir()
+    for name in files:
+        (tmp_path / name).write_text("mine")
+    out = str(tmp_path / output)
+    assert run(["collect", "walk", "--rig", f"{OWN}:port=x", "-o", out, *force]) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+    assert sorted(each.name for each in tmp_path.iterdir()) == sorted(folders + files)
+
+
+@pytest.mark.parametrize("name", ["r.toml", "r.log.jsonl"])
+def test_what_belongs_to_an_older_recording_is_kept_before_the_rig_moves(
+    tmp_path, capsys, monkeypatch, name
+):
+    monkeypatch.setattr("surgisoft.rig.trial.collect", lambda *_, **__: 1 / 0)
+    (tmp_path / name).write_text("mine")
+    out = str(tmp_path / "r.csv")
+    assert run(["collect", "walk", "--rig", f"{OWN}:port=x", "-o", out]) == 2
+    assert "--force" in capsys.readouterr().err
+    assert (tmp_path / name).read_text() == "mine"
+
+
+def test_a_dry_run_writes_nothing_so_an_older_recording_is_not_in_its_way(tmp_path, capsys):
+    out, plan = tmp_path / "r.csv", tmp_path / "plan.csv"
+    out.write_text("mine")
+    plan.write_text("t_s,c1_kPa,c2_kPa,c3_kPa\n0,0,0,0\n0.1,0,0,1\n")
+    words = ["collect", str(plan), "--rig", f"{OWN}:port=x", "-o", str(out), "--dry-run"]
+    assert run(words) == 0
+    shown = capsys.readouterr().out
+    assert shown.splitlines()[0] == "vent and rest"
+    assert "send    0.000    0.000    0.500 kPa" in shown
+    assert out.read_text() == "mine"
+    assert run([*words, "--hidden", "creep"]) == 2
+    assert "unknown option 'hidden'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("rig", ["virtual", f"{OWN}:port=x"])
+@pytest.mark.parametrize("others", ["", "0,0,0,0,1\n1,9,0,0,1\n"])
+def test_a_run_too_short_for_a_sample_is_refused(tmp_path, capsys, rig, others):
+    """24 ms of a rig that measures every 50 ms, alone and before a run of a second."""
+    plan, out = tmp_path / "plan.csv", tmp_path / "r.csv"
+    plan.write_text(f"t_s,c1_kPa,c2_kPa,c3_kPa,run\n0,0,0,0,7\n0.024,1,0,0,7\n{others}")
+    assert run(["collect", str(plan), "--rig", rig, "-o", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert "run 7 is too short for a sample of the rig, which measures every 0.05 s" in error
+    assert list(tmp_path.iterdir()) == [plan]
 
 
 def test_the_elastica_rig_without_pyelastica_says_what_to_install(tmp_path, capsys, monkeypatch):

@@ -148,17 +148,24 @@ class RecordingLog:
             os.fsync(self._file.fileno())
 
 
+def check_log_free(path: Path, force: bool = False) -> None:
+    """Raise InputError where `recording_log` would refuse this path."""
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder, expected the name of a new log; move it away")
+    if path.exists() and not force:
+        raise InputError(
+            f"{path}: the log of an interrupted recording is there; use it ('surgisoft recording "
+            f"{path}' reads it), remove it, or use --force (in Python force=True)"
+        )
+
+
 @contextlib.contextmanager
 def recording_log(
     path: str | Path, header: LogHeader, force: bool = False
 ) -> Iterator[RecordingLog]:
     """Begin a log; the file stays when the block ends, however it ends."""
     path = Path(path)
-    if path.exists() and not force:
-        raise InputError(
-            f"{path}: the log of an interrupted recording is there; use it ('surgisoft recording "
-            f"{path}' reads it), remove it, or use --force (in Python force=True)"
-        )
+    check_log_free(path, force)
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", encoding="utf-8") as file:
         log = RecordingLog(file, header)

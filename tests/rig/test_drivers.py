@@ -86,6 +86,27 @@ def test_the_json_stream_is_read_and_written():
 
 
 @pytest.mark.parametrize(
+    ("body", "position", "rotation"),
+    [
+        (b'{"position":[1,2,3],"rotation":null}', [1.0, 2.0, 3.0], [np.nan] * 4),
+        (b'{"position":[0,0,0],"rotation":null,"valid":false}', [np.nan] * 3, [np.nan] * 4),
+        (b'{"position":null,"rotation":[0,0,0,1]}', [np.nan] * 3, STILL),
+        (b"null", [np.nan] * 3, [np.nan] * 4),
+    ],
+)
+def test_a_body_without_a_pose_is_lost_alone(body, position, rotation):
+    """The points and the other bodies of its frame are there."""
+    others = b'"c":{"position":[7,8,9]}},"points":{"tip":[4,5,6]}}'
+    frame = decode_json(b'{"frame":1,"t":0,"bodies":{"b":' + body + b"," + others)
+    np.testing.assert_array_equal(frame.bodies["b"].position_mm, position)
+    np.testing.assert_array_equal(frame.bodies["b"].rotation, rotation)
+    np.testing.assert_array_equal(frame.bodies["c"].position_mm, [7.0, 8.0, 9.0])
+    np.testing.assert_array_equal(frame.points["tip"], [4.0, 5.0, 6.0])
+    turned = Frame(2, 0.1, {}, {"b": Body(np.ones(3), np.full(4, np.nan))})
+    np.testing.assert_array_equal(decode_json(encode_json(turned)).bodies["b"].position_mm, 1.0)
+
+
+@pytest.mark.parametrize(
     "packet",
     [
         b"",

@@ -8,7 +8,7 @@ The vendor-neutral stream is one datagram a frame, a JSON object:
 
 `frame` counts frames, `t` is the time of exposure on the sender's clock [s], `unit` one of mm, cm
 and m (default mm). A point that is not seen is null or left out; a body that is not tracked has
-`valid: false`.
+`valid: false`, or is null; a position or an orientation that is not known is null.
 """
 
 from __future__ import annotations
@@ -32,6 +32,8 @@ MM_PER = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 """Millimetres in each unit of length."""
 KEPT = 4096
 """Frames that wait to be read."""
+STILL = (0.0, 0.0, 0.0, 1.0)
+"""Quaternion of a body whose axes are those of the cameras' frame."""
 PACKET = 65536
 """Largest datagram [bytes]."""
 DAMAGED = (ValueError, IndexError, OverflowError, RecursionError)
@@ -45,7 +47,8 @@ class Body:
     position_mm: np.ndarray
     """(3,) position, frame of the cameras [mm]; NaN where it is not tracked."""
     rotation: np.ndarray
-    """(4,) unit quaternion x, y, z, w from the body's axes to the cameras' frame."""
+    """(4,) unit quaternion x, y, z, w from the body's axes to the cameras' frame; NaN where it is
+    not known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,18 +80,9 @@ def decode_json(packet: bytes) -> Frame | None:
     try:
         scale = MM_PER[content.get("unit", "mm")]
         points = {
-            str(name): scale * np.array(at if at is not None else [math.nan] * 3, np.float64)
-            for name, at in content.get("points", {}).items()
+            str(name): scale * _numbers(at, 3) for name, at in content.get("points", {}).items()
         }
-        bodies = {
-            str(name): Body(
-                scale * np.array(b["position"], np.float64)
-                if b.get("valid", True)
-                else np.full(3, math.nan),
-                np.array(b.get("rotation", (0.0, 0.0, 0.0, 1.0)), np.float64),
-            )
-            for name, b in content.get("bodies", {}).items()
-        }
+        bodies = {str(name): _body(b, scale) for name, b in content.get("bodies", {}).items()}
         frame = Frame(int(content["frame"]), float(content["t"]), points, bodies)
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"not a whole frame ({error})") from error
@@ -97,6 +91,20 @@ def decode_json(packet: bytes) -> Frame | None:
     if any(b.position_mm.shape != (3,) or b.rotation.shape != (4,) for b in bodies.values()):
         raise ValueError("a body has not three coordinates and four of a quaternion")
     return frame
+
+
+def _body(content: dict | None, scale: float) -> Body:
+    """The pose in a body's object; scale: mm in its unit of length. None: it is not tracked."""
+    if content is None or not content.get("valid", True):
+        return Body(_numbers(None, 3), _numbers(None, 4))
+    return Body(
+        scale * _numbers(content["position"], 3), _numbers(content.get("rotation", STILL), 4)
+    )
+
+
+def _numbers(values: list | None, count: int) -> np.ndarray:
+    """Values as float64; None: (count,) NaN."""
+    return np.full(count, math.nan) if values is None else np.array(values, np.float64)
 
 
 def encode_json(frame: Frame) -> bytes:

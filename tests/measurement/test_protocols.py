@@ -214,6 +214,26 @@ def test_the_farther_end_of_a_range_is_the_one_that_is_used(name):
         assert np.sign(farthest) == np.sign(low + high)
 
 
+@pytest.mark.parametrize("chambers", [8, 10, 14])
+def test_grid_of_many_chambers_visits_its_lattice_once(chambers):
+    """8! orders with 2^8 directions would be ten million."""
+    points = 2**chambers
+    commands = make_protocol("grid", [[0.0, 1.0]] * chambers, points).commands
+    assert len(np.unique(commands, axis=0)) == points
+    assert set(np.unique(commands)) == {0.0, 1.0}
+
+
+@pytest.mark.parametrize("name", ["grid", "traverse"])
+def test_a_lattice_that_is_too_large_is_refused(name):
+    """2^22 points of 22 chambers, and five levels of 13 chambers."""
+    for chambers, points, says in (
+        (22, 100, r"2 levels for each of 22 chambers has 4.19e\+06 set-points, expected at most"),
+        (13, 10**9, r"5 levels for each of 13 chambers has 1.22e\+09 set-points, expected at most"),
+    ):
+        with pytest.raises(InputError, match=says):
+            make_protocol(name, [[0.0, 50.0]] * chambers, points)
+
+
 def test_limits_that_are_no_ranges_get_one_line():
     for limits in ([[0.0, 0.0]], [[5.0, 1.0]], [[0.0, np.nan]], [0.0, 1.0], np.zeros((0, 2))):
         with pytest.raises(InputError, match="expected a finite lowest and highest actuation"):

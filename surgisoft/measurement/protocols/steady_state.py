@@ -8,21 +8,38 @@ sizes.
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
+
+from surgisoft.errors import InputError
 
 RUNS = 8
 """Runs that a long protocol is divided into, so that whole runs can be held out."""
 
+MOST_INDICES = 2**26
+"""Most indices of a lattice's points, one a point and chamber (a count; half a GiB)."""
+MOST_ARRANGED = 7
+"""Most chambers of which every order with every direction is listed: 645,120 for seven, and 16
+times as many for eight (a count)."""
+
 
 def lattice_size(points: int, chambers: int) -> int:
-    """Levels a chamber of the smallest lattice with at least so many points."""
+    """Levels a chamber of the smallest lattice with at least so many points.
+
+    Raises InputError where that lattice has more than `MOST_INDICES` indices.
+    """
     levels = max(2, round(points ** (1.0 / chambers)))
     while levels**chambers < points:
         levels += 1
     while levels > 2 and (levels - 1) ** chambers >= points:
         levels -= 1
+    if levels**chambers * chambers > MOST_INDICES:
+        raise InputError(
+            f"a lattice of {levels} levels for each of {chambers} chambers has "
+            f"{levels**chambers:.3g} set-points, expected at most {MOST_INDICES // chambers:.3g}; "
+            "use the protocol 'walk', or fewer points"
+        )
     return levels
 
 
@@ -78,20 +95,33 @@ def grid(points: int, limits: np.ndarray, rng: np.random.Generator):
     levels = lattice_size(points, m)
     boxes = _cut(np.zeros(m, np.int64), np.full(m, levels - 1), rng)
     boxes.sort(key=lambda box: -int((box[1] - box[0] + 1).prod()))
-    signs = list(itertools.product([-1, 1], repeat=m))
-    deck = list(itertools.product(itertools.permutations(range(m)), signs))
-    parts = []
-    # Each round through the deck gives boxes of like size every order and every sign once.
-    for k, (lows, highs) in enumerate(boxes):
-        if k % len(deck) == 0:
-            rng.shuffle(deck)
-        order, directions = deck[k % len(deck)]
-        parts.append(back_and_forth(lows, highs, order, directions))
+    parts = [
+        back_and_forth(*box, *arranged)
+        for box, arranged in zip(boxes, _arrangements(m, rng), strict=False)
+    ]
     rng.shuffle(parts)
     path = np.concatenate(parts)
     if len(path) > points:
         path = path[np.sort(rng.choice(len(path), points, replace=False))]
     return _pressures(path, levels, limits), _in_runs(len(path), RUNS)
+
+
+def _arrangements(
+    chambers: int, rng: np.random.Generator
+) -> Iterator[tuple[Sequence[int], Sequence[int]]]:
+    """Orders of the chambers, slow to fast, and directions of each, without end.
+
+    Each round gives boxes of like size every order with every direction once. Of more than
+    `MOST_ARRANGED` chambers there are more than boxes, and each is drawn alone.
+    """
+    if chambers > MOST_ARRANGED:
+        while True:
+            yield rng.permutation(chambers).tolist(), rng.choice([-1, 1], chambers).tolist()
+    signs = itertools.product([-1, 1], repeat=chambers)
+    deck = list(itertools.product(itertools.permutations(range(chambers)), signs))
+    while True:
+        rng.shuffle(deck)
+        yield from deck
 
 
 def _cut(lows: np.ndarray, highs: np.ndarray, rng: np.random.Generator) -> list:

@@ -1,12 +1,13 @@
 """Collection of recordings: drive any rig, real or virtual, through a protocol."""
 
+import warnings
 from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 
-from surgisoft.errors import InputError
+from surgisoft.errors import AssumptionWarning, InputError
 from surgisoft.measurement.protocols import Protocol
 from surgisoft.measurement.recordings import Recording
 from surgisoft.measurement.recordings.log import (
@@ -15,6 +16,7 @@ from surgisoft.measurement.recordings.log import (
     average,
     recording_log,
 )
+from surgisoft.measurement.recordings.recording import left_out, usable_samples
 from surgisoft.progress import Progress, silent
 from surgisoft.rig.interface import Rig, Sample
 from surgisoft.rig.safety import SafeRig
@@ -51,13 +53,14 @@ def collect(
     with recording_log(log, header, force) if log else nullcontext() as writer:
         samples = _samples(rig, protocol, per_run, total, progress, writer)
     start = samples[0].t_s
+    points = np.array([s.key_points_mm for s in samples])
     temperatures = [s.temp_C for s in samples]
     return describe(
         rig,
         protocol,
         np.array([s.t_s for s in samples]) - start,
         np.array([s.measured for s in samples]),
-        np.array([s.key_points_mm for s in samples]),
+        np.where(np.isinf(points), np.nan, points),
         np.array([s.commanded for s in samples]),
         temp_C=None if None in temperatures else np.array(temperatures),
     )
@@ -177,8 +180,23 @@ def describe(
     noise_mm: float | None = None,
     temp_C: np.ndarray | None = None,
 ) -> Recording:
-    """The recording of a rig's samples; arguments as in `Recording`."""
+    """The recording of a rig's samples; arguments as in `Recording`.
+
+    Samples that it cannot have (`usable_samples`) are left out, with an `AssumptionWarning`. Raises
+    InputError where none is left.
+    """
     counts = [(run, len(commands)) for run, commands in runs_of(protocol, rig.period_s)]
+    run_ids = np.concatenate([np.full(count, run, np.int64) for run, count in counts])
+    usable = usable_samples(t_s, run_ids, measured, commanded)
+    if not usable.any():
+        raise InputError(
+            f"protocol '{protocol.name}': no sample has every pressure; are the sensors connected?"
+        )
+    if not usable.all():
+        warnings.warn(left_out(int((~usable).sum())), AssumptionWarning, stacklevel=2)
+        t_s, measured, key_points_mm = t_s[usable], measured[usable], key_points_mm[usable]
+        commanded, run_ids = commanded[usable], run_ids[usable]
+        temp_C = None if temp_C is None else temp_C[usable]
     payload = rig.payload_g
     return Recording(
         name=protocol.name,
@@ -186,7 +204,7 @@ def describe(
         measured=measured,
         key_points_mm=key_points_mm,
         commanded=commanded,
-        run=np.concatenate([np.full(count, run, np.int64) for run, count in counts]),
+        run=run_ids,
         unit=rig.unit,
         temp_C=temp_C,
         payload_g=None if payload is None else np.full(len(t_s), payload),

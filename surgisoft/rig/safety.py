@@ -401,6 +401,11 @@ class SafeRig:
             self._stop(
                 f"a sample has {np.size(sample.measured)} pressures, expected {self.chambers}"
             )
+        if np.shape(sample.key_points_mm) != (self.key_planes, 3):
+            self._stop(
+                f"a sample has key points of shape {np.shape(sample.key_points_mm)}, expected "
+                f"{(self.key_planes, 3)}"
+            )
         if not np.isfinite(sample.key_points_mm).any():
             self._blind = "no key point was seen"
         elif silent.any():

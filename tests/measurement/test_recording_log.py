@@ -5,18 +5,21 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from surgisoft.cli import run
-from surgisoft.errors import InputError
+from surgisoft.errors import AssumptionWarning, InputError
 from surgisoft.measurement.protocols import Protocol
 from surgisoft.measurement.recordings import load_recording
 from surgisoft.measurement.recordings.log import LogHeader, read_log, recording_log
 from surgisoft.measurement.recordings.recording import ArmInfo
 from surgisoft.rig import VirtualRig, collect
+from surgisoft.rig.trial import collect as collect_on
+from tests.rig.test_safety import Valves
 
 SETTLED = Protocol("p", "settled", [[5.0, 0, 0], [9.0, 0, 3], [0, 0, 7]], [0, 0, 1], None, 0.2, 0.2)
 MOVING = Protocol("w", "continuous", [[0, 0, 0], [8.0, 2, 0]], [3, 3], [0.0, 0.5])
@@ -51,6 +54,40 @@ def test_a_temperature_that_a_frame_lacks_is_none_of_the_recording(tmp_path):
     del lines[2]["temp_C"]
     log.write_text("".join(json.dumps(line) + "\n" for line in lines))
     assert read_log(log)[0].temp_C is None
+
+
+class Flickering(Valves):
+    """Of 20 samples the sensors are silent in two, and the clock stands still in one."""
+
+    def read(self):
+        sample = super().read()
+        k = round(self.t_s / self.period_s)
+        if k in (5, 6):
+            return replace(sample, measured=np.array([1.0, np.nan]))
+        return replace(sample, t_s=sample.t_s - (self.period_s if k == 12 else 0.0))
+
+
+def test_samples_without_a_pressure_or_a_later_time_are_left_out(tmp_path):
+    """The others are kept, by the recording and by its log alike; times are of 20 Hz."""
+    log = tmp_path / "w.log.jsonl"
+    plan = Protocol("w", "continuous", [[0.0, 0.0], [8.0, 2.0]], [3, 3], [0.0, 1.0])
+    with pytest.warns(AssumptionWarning, match="3 samples left out: without a pressure, or"):
+        recording = collect_on(plan, Flickering(), log=log)
+    kept = [k for k in range(20) if k not in (4, 5, 11)]
+    np.testing.assert_allclose(recording.t_s, 0.05 * np.array(kept), atol=1e-12)
+    assert np.isfinite(recording.measured).all()
+    with pytest.warns(UserWarning, match="3 samples left out: without a pressure, or"):
+        read = load_recording(log)
+    for name in ("t_s", "measured", "key_points_mm", "commanded", "run"):
+        np.testing.assert_allclose(getattr(read, name), getattr(recording, name), atol=1e-12)
+
+
+def test_a_log_without_any_pressure_is_one_line(tmp_path):
+    log = tmp_path / "w.log.jsonl"
+    with recording_log(log, LogHeader("w", "continuous", "kPa", 1, 1, ArmInfo())) as writer:
+        writer.sample(0, 0, 0.0, np.array([np.nan]), np.zeros((1, 3)))
+    with pytest.raises(InputError, match="has no sample with every pressure"):
+        read_log(log)
 
 
 def test_a_torn_log_opens_and_says_what_is_missing(tmp_path, capsys):

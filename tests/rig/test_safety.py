@@ -435,6 +435,16 @@ def test_commands_and_samples_of_another_number_of_chambers_do_not_pass():
     assert valves.vents >= 1
 
 
+def test_a_sample_with_another_number_of_key_points_stops_at_once():
+    """And not when the recording of the whole run is put together."""
+    valves = Valves()
+    rig = SafeRig(valves)
+    valves.points = np.zeros((2, 3))
+    with pytest.raises(RigStopped, match=r"key points of shape \(2, 3\), expected \(1, 3\)"):
+        rig.read()
+    assert valves.vents >= 1
+
+
 def test_a_dry_run_shows_and_sends_nothing():
     bench, shown = Valves(), []
     with SafeRig(bench, Safety(rate=100.0), shown.append) as rig:

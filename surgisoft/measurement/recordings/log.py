@@ -23,7 +23,12 @@ import numpy as np
 from surgisoft.config import Where, at_least, describe, from_table
 from surgisoft.errors import InputError
 from surgisoft.files import json_safe
-from surgisoft.measurement.recordings.recording import ArmInfo, Recording
+from surgisoft.measurement.recordings.recording import (
+    ArmInfo,
+    Recording,
+    left_out,
+    usable_samples,
+)
 
 SUFFIX = ".jsonl"
 """Suffix of a log's file."""
@@ -205,24 +210,31 @@ def read_log(path: str | Path) -> tuple[Recording, str]:
     def column(name: str, *shape: int) -> np.ndarray:
         return np.array([average(_floats(group, name, shape))[0] for group in ordered])
 
-    t_s = column("t_s")
+    t_s, measured = column("t_s"), column("p", header.chambers)
+    run = np.array([group[-1]["run"] for group in ordered], np.int64)
+    usable = usable_samples(t_s, run, measured, _last(ordered, "c", header.chambers))
+    lacking = []
+    if not usable.all():
+        lacking.append(left_out(int((~usable).sum())))
+        ordered = [group for group, good in zip(ordered, usable, strict=True) if good]
+        if not ordered:
+            raise InputError(f"{path}: the log has no sample with every pressure; expected one")
     recording = Recording(
         name=header.name,
-        t_s=t_s - t_s[0],
-        measured=column("p", header.chambers),
+        t_s=(t_s - t_s[0])[usable],
+        measured=measured[usable],
         key_points_mm=column("k", header.key_points, 3),
         commanded=_last(ordered, "c", header.chambers),
-        run=np.array([group[-1]["run"] for group in ordered], np.int64),
+        run=run[usable],
         unit=header.unit,
         temp_C=column("temp_C") if all("temp_C" in line for line in lines[1:]) else None,
-        payload_g=None if header.payload_g is None else np.full(len(t_s), header.payload_g),
+        payload_g=None if header.payload_g is None else np.full(len(ordered), header.payload_g),
         arm=header.arm,
         gravity=None if header.gravity is None else np.array(header.gravity),
         kind=header.kind,
         note=header.note,
         source=path,
     )
-    lacking = []
     if header.rows is not None and len(rows) < header.rows:
         lacking.append(f"it was interrupted after {len(rows)} of {header.rows} samples")
     if torn:

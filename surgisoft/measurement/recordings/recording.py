@@ -13,7 +13,7 @@ from typing import Annotated
 import numpy as np
 
 from surgisoft.config import POSITIVE, Rule
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, counted
 
 KINDS = ("continuous", "settled")
 """Kinds of recordings and protocols: samples at a rate, or steady-state averages."""
@@ -236,6 +236,37 @@ def first_time_backwards(t_s: np.ndarray, run: np.ndarray) -> int | None:
     """
     bad = np.flatnonzero((np.diff(t_s) <= 0) & (np.diff(run) == 0))
     return int(bad[0]) + 1 if len(bad) else None
+
+
+def usable_samples(
+    t_s: np.ndarray, run: np.ndarray, measured: np.ndarray, commanded: np.ndarray | None
+) -> np.ndarray:
+    """(T,) bool: the samples of a bench that a recording can have.
+
+    Those whose actuation is known and whose time is later than that of every usable one before it
+    in its run; a pressure sensor may be silent for a moment, and a clock may repeat a time. t_s:
+    (T,) [s]; run: (T,) ids; measured, commanded: (T, m).
+    """
+    usable = np.isfinite(t_s) & np.isfinite(measured).all(axis=1)
+    if commanded is not None:
+        usable &= np.isfinite(commanded).all(axis=1)
+    kept = np.flatnonzero(usable)
+    if first_time_backwards(t_s[kept], run[kept]) is None:
+        return usable
+    latest: dict[int, float] = {}
+    for k in kept.tolist():
+        usable[k] = t_s[k] > latest.get(int(run[k]), -np.inf)
+        if usable[k]:
+            latest[int(run[k])] = float(t_s[k])
+    return usable
+
+
+def left_out(count: int) -> str:
+    """What is said about so many samples that are not usable, see `usable_samples`."""
+    return (
+        f"{counted(count, 'sample')} left out: without a pressure, or with a time that is not "
+        "later than the one before"
+    )
 
 
 def first_run_again(run: np.ndarray) -> int | None:

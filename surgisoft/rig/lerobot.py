@@ -61,11 +61,18 @@ class NamedRig:
         return self._driven is not None
 
     def connect(self) -> None:
-        """Begin to drive: vent the arm and wait until it is at rest."""
+        """Begin to drive: vent the arm and wait until it is at rest.
+
+        Where that fails the devices are given back, and the rig is not connected.
+        """
         if self._driven is not None:
             raise InputError(f"rig '{self._text}': connected already")
         self._driven = self._open.enter_context(guarded(self._opened))
-        self._driven.reset()
+        try:
+            self._driven.reset()
+        except BaseException:
+            self.disconnect()
+            raise
         self._command = vented(self._driven.limits)
 
     def disconnect(self) -> None:

@@ -253,6 +253,9 @@ class SafeRig:
                 signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
 
     def __enter__(self) -> SafeRig:
+        # a rig may be driven in one block after another
+        self._over.clear()
+        self._signalled, self._called = False, self._clock()
         if threading.current_thread() is threading.main_thread():
             for number in STOP_SIGNALS:
                 self._handlers[number] = signal.signal(number, self._on_signal)

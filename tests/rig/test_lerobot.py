@@ -94,6 +94,24 @@ def test_lost_key_point_is_nan_or_held(monkeypatch):
         assert (rig.log[0], rig.log[-1]) == ("reset", 0.0)  # at rest before, vented after
 
 
+def test_a_rig_that_does_not_come_to_rest_is_vented_and_given_back(monkeypatch):
+    class Stuck(Blinking):
+        def reset(self):
+            raise InputError("chamber 1 is still at 9.0 kPa")
+
+        def close(self):
+            self.log.append("closed")
+
+    rig = Stuck()
+    monkeypatch.setattr("surgisoft.rig.lerobot.open_rig", lambda _: rig)
+    named = NamedRig("stuck")
+    for _ in range(2):
+        with pytest.raises(InputError, match="still at 9.0 kPa"):
+            named.connect()
+        assert not named.is_connected
+    assert rig.log == [0.0, "closed", 0.0, "closed"]
+
+
 def test_disconnected_rig_is_not_driven():
     named = NamedRig("virtual:seed=3")
     with pytest.raises(InputError, match="not connected"):

@@ -232,6 +232,22 @@ def test_a_program_that_hangs_is_vented_by_the_watchdog():
     assert bench.at.tolist() == [0.0, 0.0]
 
 
+def test_the_watchdog_and_the_emergency_stop_work_in_every_block():
+    """A rig without devices to give back can be driven again."""
+    bench = Valves()
+    rig = SafeRig(bench, Safety(hold_ms=50.0, vent_ms=100.0))
+    with rig:
+        rig.command([1.0, 1.0])
+    with pytest.raises(KeyboardInterrupt), rig:
+        signal.raise_signal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt), rig:
+        signal.raise_signal(signal.SIGINT)
+    with pytest.raises(RigStopped, match=r"no command for 0\.\d s; the rig is vented"), rig:
+        rig.command([10.0, 10.0])
+        time.sleep(5.0)
+    assert bench.at.tolist() == [0.0, 0.0]
+
+
 def test_after_a_reset_there_is_no_watchdog():
     bench = Valves()
     with SafeRig(bench, Safety(hold_ms=20.0, vent_ms=40.0)) as rig:

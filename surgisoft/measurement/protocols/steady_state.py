@@ -96,8 +96,8 @@ def grid(points: int, limits: np.ndarray, rng: np.random.Generator):
     boxes = _cut(np.zeros(m, np.int64), np.full(m, levels - 1), rng)
     boxes.sort(key=lambda box: -int((box[1] - box[0] + 1).prod()))
     parts = [
-        back_and_forth(*box, *arranged)
-        for box, arranged in zip(boxes, _arrangements(m, rng), strict=False)
+        back_and_forth(lows, highs, order, directions)
+        for (lows, highs), (order, directions) in zip(boxes, _arrangements(m, rng), strict=False)
     ]
     rng.shuffle(parts)
     path = np.concatenate(parts)

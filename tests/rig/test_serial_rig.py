@@ -257,6 +257,46 @@ def test_a_lost_answer_about_the_watchdog_is_asked_for_again():
         os.close(end)
 
 
+def test_set_points_are_not_sent_again_after_another_thread_vented(monkeypatch):
+    """The other thread gets in just before the line is free for the set points."""
+    first = []
+
+    class Contended:
+        """A lock that others may take first."""
+
+        def __init__(self):
+            self._lock = real()
+
+        def __enter__(self):
+            if first:
+                first.pop()()
+            return self._lock.__enter__()
+
+        def __exit__(self, *error):
+            return self._lock.__exit__(*error)
+
+        def __getattr__(self, name):
+            return getattr(self._lock, name)
+
+    real = threading.Lock
+    with emulated("virtual:seed=0") as bench:
+        monkeypatch.setattr("surgisoft.rig.drivers.serial_controller.threading.Lock", Contended)
+        controller = SerialController(bench.port)
+        monkeypatch.undo()
+        try:
+            controller.wait_for_report()
+            controller.command([10.0, 0.0, 0.0])
+            first.append(controller.vent)
+            controller.keep_alive()
+            until = time.monotonic() + 5.0
+            while bench.state != "I" and time.monotonic() < until:
+                time.sleep(0.01)
+            time.sleep(0.2)
+            assert (bench.state, bench.target.tolist()) == ("I", [0.0, 0.0, 0.0])
+        finally:
+            controller.close()
+
+
 def test_a_map_file_names_points_channels_and_the_frame(bench, tmp_path):
     (tmp_path / "bench.toml").write_text(
         'points = ["k0", "k2", "k4"]\nchannels = [3, 1]\ngravity = [0.0, 0.0, 1.0]\n'

@@ -209,15 +209,21 @@ class SerialController:
         return last is not None and last.state in ("I", "T") and not any(last.target)
 
     def _send_target(self) -> None:
-        target = self._target
-        if target is not None:
-            self._seq += 1
-            self._write(f"SET {self._seq} " + " ".join(f"{x:.3f}" for x in target))
+        """Send the set points; where another thread has vented meanwhile, there are none."""
+        self._seq += 1
+        self._write(lambda: self._set_points(self._seq))
 
-    def _write(self, body: str) -> None:
+    def _set_points(self, seq: int) -> str | None:
+        target = self._target
+        return None if target is None else f"SET {seq} " + " ".join(f"{x:.3f}" for x in target)
+
+    def _write(self, body: str | Callable[[], str | None]) -> None:
+        """Write a line. body: its text, or what gives it once nobody else writes; None: no line."""
         try:
             with self._lock:
-                self._serial.write(line(body))
+                text = body() if callable(body) else body
+                if text is not None:
+                    self._serial.write(line(text))
         except Exception as error:  # pyserial lets errors of the system through
             self._lost = self._lost or " ".join(str(error).split())
             self._check_line()

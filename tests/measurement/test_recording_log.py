@@ -90,6 +90,20 @@ def test_a_log_without_any_pressure_is_one_line(tmp_path):
         read_log(log)
 
 
+def test_a_run_that_ends_before_its_first_sample_leaves_no_log(tmp_path):
+    """A valve that is stuck at the start would be in the way of the next try."""
+    log = tmp_path / "w.log.jsonl"
+
+    class Stuck(Valves):
+        def reset(self):
+            raise InputError("chamber 1 is still at 9.0 kPa")
+
+    for _ in range(2):
+        with pytest.raises(InputError, match="chamber 1 is still at"):
+            collect_on(Protocol("p", "settled", [[1.0, 2.0]], [0]), Stuck(), log=log)
+        assert list(tmp_path.iterdir()) == []
+
+
 def test_a_torn_log_opens_and_says_what_is_missing(tmp_path, capsys):
     log = tmp_path / "r.log.jsonl"
     whole = collect(VirtualRig(1), SETTLED, log=log)

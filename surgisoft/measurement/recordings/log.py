@@ -75,6 +75,8 @@ class RecordingLog:
     """A log that is being written."""
 
     def __init__(self, file: TextIO, header: LogHeader) -> None:
+        self.samples = 0
+        """Samples that were appended so far."""
         self._file = file
         self._lines: queue.Queue[str | None] = queue.Queue(WAITING_LINES)
         self._failed: OSError | None = None
@@ -105,6 +107,7 @@ class RecordingLog:
         if temp_C is not None:
             found["temp_C"] = temp_C
         self._line(found)
+        self.samples += 1
 
     def close(self) -> None:
         """Write the log out; it stays where it is. Raises OSError where a line could not be."""
@@ -168,7 +171,10 @@ def check_log_free(path: Path, force: bool = False) -> None:
 def recording_log(
     path: str | Path, header: LogHeader, force: bool = False
 ) -> Iterator[RecordingLog]:
-    """Begin a log; the file stays when the block ends, however it ends."""
+    """Begin a log; the file stays when the block ends, however it ends.
+
+    A block that an exception ends before the first sample leaves none: nobody could open it.
+    """
     path = Path(path)
     check_log_free(path, force)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -176,6 +182,10 @@ def recording_log(
         log = RecordingLog(file, header)
         try:
             yield log
+        except BaseException:
+            if not log.samples:
+                path.unlink(missing_ok=True)
+            raise
         finally:
             log.close()
 

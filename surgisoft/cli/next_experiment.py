@@ -89,6 +89,11 @@ def next_experiment(
     if record:
         from surgisoft.rig.registry import check_rig
 
+        if record.absolute() == output.absolute():
+            raise InputError(
+                f"{record}: is given for the schedule (-o) and for the recording (--record); "
+                "expected two files"
+            )
         check_new_recording(record, force)
         check_rig(rig)
     check_model(model, predictions)

@@ -481,6 +481,7 @@ REFUSED = {
     "evaluate scripted --rules liver --task keyhole": "is an experiment of circle_ablation, not of",
     "evaluate scripted --rules liver --config a.toml": "--config and --rules both set the task",
     "next-experiment default -o {dir}/a.txt": "suffix '.txt', expected .csv, which `collect` can",
+    "next-experiment default -o {dir}/a.csv --record {dir}/a.csv": "is given for the schedule (-o)",
     "next-experiment default -o {dir}/full.csv": "full.csv: exists already; choose another name",
     "collect walk --preflight -o {dir}/a.csv": "expected the model of this arm too; add --arm",
     "collect walk --arm default -o {dir}/a.csv": "--arm names the model of the pre-flight check",

@@ -45,6 +45,11 @@ MAPS = [
     ),
     (
         'column = "t"',
+        'column = "t"\nrate_hz = 5\nunit = "ms"',
+        "time.unit: got text 'ms'; expected none beside rate_hz, which states seconds already",
+    ),
+    (
+        'column = "t"',
         'column = "t"\nunit = "days"',
         "time.unit: got text 'days'; expected one of s",
     ),
@@ -277,6 +282,27 @@ def test_command_and_measurement_must_fit(tmp_path):
         map_path.write_text(f"{GOOD}[commanded]\n{extra}\n")
         spec = load_map(str(map_path))
         assert expected in message_of(lambda spec=spec: import_files([path], spec, "x"))
+
+
+@pytest.mark.parametrize(
+    ("fields", "expected"),
+    [
+        ("scale = [1, 2, 3]", "[measured] scale of the map is [1.0, 2.0, 3.0], expected one number"),
+        ("offset = [1, 2, 3]", "[measured] offset of the map is [1.0, 2.0, 3.0], expected one numb"),
+        (
+            'unit = "bar"',
+            'columns p1_kPa ... p2_kPa state kPa, but the map unit = "bar" in [measured]',
+        ),
+    ],
+)
+def test_what_a_map_says_of_columns_that_it_leaves_to_their_names(tmp_path, fields, expected):
+    path, map_path = tmp_path / "raw.csv", tmp_path / "map.toml"
+    path.write_text("t,p1_kPa,p2_kPa,x,y,z\n0,1,2,3,4,5\n1,2,3,4,5,6\n")
+    map_path.write_text(GOOD.replace('columns = ["u"]\nunit = "kPa"', fields))
+    spec = load_map(str(map_path))
+    message = message_of(lambda: import_files([path], spec, "x"))
+    assert message.startswith(str(path))
+    assert expected in message
 
 
 def test_a_compressed_file_cannot_unpack_without_bound(tmp_path, monkeypatch):

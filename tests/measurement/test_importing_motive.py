@@ -82,6 +82,8 @@ def test_a_unit_in_the_map_counts_and_not_that_of_the_file(tmp_path):
     (part,) = import_files(files, known, "x")
     found = 100.0 * part.recording.key_points_mm
     np.testing.assert_allclose(found, stated.key_points_mm, atol=1e-9)
+    said = 'states that its positions are in m, but the map unit = "cm" in [key_points]'
+    assert any(said in note for note in part.notes)
 
 
 def test_bend_is_not_mirrored(tmp_path):

@@ -96,3 +96,22 @@ def test_a_log_without_sensors_and_an_arm_in_a_plane_use_columns_twice(tmp_path)
     again = 'unit = "kPa"\n[commanded]\ncolumns = ["P1 [kPa]", "P2 [kPa]"]\nunit = "kPa"'
     assert notes(tmp_path, MAP.replace('unit = "kPa"', again)) == []
     assert notes(tmp_path, MAP.replace('"m1 y [mm]"', '"m0 y [mm]"')) == []
+
+
+def test_scaled_columns_that_the_map_leaves_to_their_names_have_the_unit_of_the_map(tmp_path):
+    (tmp_path / "lab.csv").write_text("t,p1_kPa,x,y,z\n0,100,0,0,50\n1,150,1,0,50\n")
+    content = """
+[time]
+column = "t"
+[measured]
+unit = "bar"
+scale = 0.01
+[key_points]
+positions = [["x", "y", "z"]]
+unit = "mm"
+"""
+    (tmp_path / "map.toml").write_text(content)
+    spec = load_map(str(tmp_path / "map.toml"))
+    found = import_files([tmp_path / "lab.csv"], spec, "x")[0].recording
+    assert found.unit == "bar"
+    np.testing.assert_allclose(found.measured[:, 0], [1.0, 1.5])

@@ -52,8 +52,10 @@ from surgisoft.measurement.recordings.lerobot import is_dataset, load_lerobot
 from surgisoft.measurement.recordings.log import SUFFIX as LOG_SUFFIX
 from surgisoft.measurement.recordings.log import read_log
 from surgisoft.measurement.recordings.quality import without_frozen, without_spikes
-from surgisoft.measurement.units import factor
+from surgisoft.measurement.units import factor, unit_named
 
+COLUMN_LETTERS = {"measured": "p", "commanded": "c"}
+"""First letter of the columns of an actuation that the map leaves to their names."""
 _ENDINGS = (".gz", ".bz2", ".xz", ".csv", ".tsv", ".txt", ".dat", ".log", ".parquet")
 
 
@@ -202,8 +204,8 @@ def _patterns(spec: ImportMap) -> str:
 def _import_set(files: dict[str, Path], spec: ImportMap) -> Imported:
     """One set of files as a recording on the clock of the main file."""
     tables = {name: open_raw(path, spec.file[name]) for name, path in files.items()}
-    measured = _with_columns(spec.measured, tables, "p")
-    commanded = _with_columns(spec.commanded, tables, "c") if spec.commanded else None
+    measured = _with_columns(spec.measured, tables, "measured")
+    commanded = _with_columns(spec.commanded, tables, "commanded") if spec.commanded else None
     commanded = commanded if commanded and commanded.columns else None
     _check_actuation(measured, commanded, tables)
     said = check_columns(uses(spec, measured, commanded), tables)
@@ -231,6 +233,7 @@ def _import_set(files: dict[str, Path], spec: ImportMap) -> Imported:
             f"{tables[spec.key_points.file].path}: does not state the unit of the positions, "
             "expected unit in [key_points] of the map"
         )
+    said += _other_unit_than_stated(spec, tables[spec.key_points.file])
     placed = read_points(joined, spec.key_points, points, spec.frame, unit_mm)
     draft = Draft(
         row=joined.rows,
@@ -247,11 +250,26 @@ def _import_set(files: dict[str, Path], spec: ImportMap) -> Imported:
     return Imported(recording, [*said, *joined.notes, *placed.notes, *notes])
 
 
-def _with_columns(spec: ActuationMap, tables: dict[str, RawTable], letter: str) -> ActuationMap:
-    """The map's columns, or those named as in a recording, with the unit of their suffix."""
+def _other_unit_than_stated(spec: ImportMap, table: RawTable) -> list[str]:
+    """A note where the map reads positions in another unit than the file states."""
+    unit = spec.key_points.unit
+    if unit is None or spec.key_points.scale != 1.0 or table.unit in ("", unit):
+        return []
+    return [
+        f"{table.path} states that its positions are in {table.unit}, but the map unit = "
+        f'"{unit}" in [key_points]: if the file is right, leave out unit'
+    ]
+
+
+def _with_columns(spec: ActuationMap, tables: dict[str, RawTable], part: str) -> ActuationMap:
+    """The map's columns, or those named as in a recording, with the unit of their suffix.
+
+    part: the table of the map, [measured] or [commanded]. Raises InputError where the map's unit,
+    scale or offset do not fit the columns that are found.
+    """
     if spec.columns:
         return spec
-    table = tables[spec.file]
+    table, letter = tables[spec.file], COLUMN_LETTERS[part]
     pattern = re.compile(rf"{letter}([1-9][0-9]{{0,8}})_([A-Za-z%][A-Za-z0-9%]*)")
     found = sorted(
         (int(match[1]), match[2], name)
@@ -264,12 +282,33 @@ def _with_columns(spec: ActuationMap, tables: dict[str, RawTable], letter: str) 
             f"{table.path}: columns {', '.join(name for _, _, name in found)}, expected "
             f"{letter}1_UNIT, {letter}2_UNIT, ... of one unit without gaps, or columns in the map"
         )
-    if not found and letter == "p":
+    if not found and part == "measured":
         raise InputError(
             f"{table.path}: no column 'p1_kPa' or with another unit, expected the measured "
             "actuation; name its columns in [measured] of the map"
         )
-    return replace(spec, columns=tuple(n for _, _, n in found), unit=units.pop() if units else "")
+    if not found:
+        return spec
+    names = tuple(name for _, _, name in found)
+    counted = f"{names[0]}{f' ... {names[-1]}' if names[1:] else ''}"
+    for field in ("scale", "offset"):
+        value = getattr(spec, field)
+        if isinstance(value, tuple) and len(value) not in (1, len(names)):
+            raise InputError(
+                f"{table.path}: {len(names)} columns {counted}, but [{part}] {field} of the map is "
+                f"{[*value]}, expected one number, or {len(names)}, one per channel"
+            )
+    unit = units.pop()
+    if spec.unit in ("", unit):
+        return replace(spec, columns=names, unit=unit)
+    converts = spec.scale is not None or spec.offset is not None
+    if not converts and spec.unit != unit_named(unit):
+        raise InputError(
+            f"{table.path}: columns {counted} state {unit}, but the map unit = "
+            f'"{spec.unit}" in [{part}], expected the same unit; leave out unit, or use to = '
+            f'"{spec.unit}" to convert, or name the columns in the map if their names are wrong'
+        )
+    return replace(spec, columns=names)
 
 
 def _check_actuation(

@@ -101,6 +101,10 @@ class TimeMap:
         """The table itself; raises InputError unless it has a column or a rate."""
         if self.column is None and self.rate_hz is None:
             raise where.error("neither column nor rate_hz", "a column, a rate, or both")
+        if self.rate_hz is not None and self.unit != "s":
+            raise (where / "unit").error(
+                f"got {describe(self.unit)}", "none beside rate_hz, which states seconds already"
+            )
         if self.scale != 1.0 and (self.rate_hz is not None or self.unit == "iso"):
             raise (where / "scale").error(
                 f"got {self.scale:g}", "none beside rate_hz or dates, which state seconds already"

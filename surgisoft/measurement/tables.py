@@ -91,9 +91,14 @@ class ParquetTable:
                     raise pa.ArrowInvalid("true and false are not numbers")
                 values = column.cast(pa.float64(), safe=False)
             except pa.ArrowException:
+                dates = (
+                    '; unit = "iso" reads dates as times'
+                    if pa.types.is_timestamp(column.type)
+                    else ""
+                )
                 raise InputError(
-                    f"{self.path}, column '{self.names[position]}': holds {column.type}, "
-                    "expected numbers"
+                    f"{self.path}, column {label(self.names, position)}: holds {column.type}, "
+                    f"expected numbers{dates}"
                 ) from None
             columns.append(values.to_numpy())
         return np.column_stack(columns).astype(np.float64, copy=False)
@@ -101,19 +106,36 @@ class ParquetTable:
     def texts(self, position: int) -> list[str]:
         """Cells (T,) of a column as text; empty where missing."""
         (column,) = self._read([position])
-        return ["" if value is None else str(value) for value in column.to_pylist()]
+        try:
+            if pa.types.is_timestamp(column.type):  # Python's dates have microseconds
+                zone = "UTC" if column.type.tz else None
+                column = column.cast(pa.timestamp("us", zone), safe=False)
+            elif column.type in (pa.duration("ns"), pa.time64("ns")):
+                column = column.cast(pa.string())
+            return ["" if value is None else str(value) for value in column.to_pylist()]
+        except (pa.ArrowException, ValueError, OverflowError):
+            raise InputError(
+                f"{self.path}, column {label(self.names, position)}: holds {column.type} that "
+                "cannot be read as text, expected text, numbers or dates"
+            ) from None
 
     def place(self, row: int) -> str:
         """File and row, counted from 1, of a row for messages."""
         return f"{self.path}, row {row + 1}"
 
     def _read(self, positions: Sequence[int]) -> list[pa.ChunkedArray]:
-        names = [self.names[i] for i in positions]
+        names = list(dict.fromkeys(self.names[i] for i in positions))
         try:
             table = pq.ParquetFile(self.path).read(columns=names)
         except (pa.ArrowException, OSError, ValueError) as error:
             raise InputError(f"{self.path}: not a readable Parquet file") from error
-        return [table.column(name) for name in names]
+        places: dict[str, list[int]] = {}
+        for place, name in enumerate(table.column_names):  # in the order of the file
+            places.setdefault(name, []).append(place)
+        return [
+            table.column(places[self.names[i]][self.names[:i].count(self.names[i])])
+            for i in positions
+        ]
 
 
 def read_text(path: Path) -> bytes:

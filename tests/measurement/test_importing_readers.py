@@ -71,6 +71,32 @@ def test_parquet_by_name_and_by_ending(tmp_path, name):
     np.testing.assert_array_equal(part.recording.measured[:, 0], values[:, 1])
 
 
+@pytest.mark.parametrize("zone", [None, "UTC", "Europe/Berlin"])
+def test_dates_in_nanoseconds_are_times(tmp_path, zone):
+    """As pandas writes them; Python's own dates have microseconds."""
+    path, values = tmp_path / "raw.parquet", table()
+    steps = np.array([0, 50_000_007, 100_000_014, 150_000_021, 200_000_028])
+    dates = pa.array(1_714_564_800_000_000_000 + steps, pa.timestamp("ns", zone))
+    columns = {c: values[:, i] for i, c in enumerate("tuxyz")}
+    pq.write_table(pa.table(columns | {"t": dates}), path)
+    spec = write_map(tmp_path, "auto")
+    with pytest.raises(InputError, match=r'column \'t\': holds timestamp.*; unit = "iso" reads'):
+        import_files([path], load_map(spec), "r")
+    Path(spec).write_text(Path(spec).read_text().replace('"t"\n', '"t"\nunit = "iso"\n', 1))
+    (part,) = import_files([path], load_map(spec), "r")
+    np.testing.assert_allclose(part.recording.t_s, steps / 1e9, atol=2e-6)
+
+
+def test_columns_of_one_name_are_read_by_their_numbers(tmp_path):
+    path, values = tmp_path / "raw.parquet", table()
+    arrays_ = [pa.array(values[:, i]) for i in range(5)]
+    pq.write_table(pa.Table.from_arrays(arrays_, names=["t", "u", "x", "x", "x"]), path)
+    spec = write_map(tmp_path, "auto")
+    Path(spec).write_text(Path(spec).read_text().replace('"x", "y", "z"', "5, 3, 4"))
+    (part,) = import_files([path], load_map(spec), "r")
+    np.testing.assert_array_equal(part.recording.key_points_mm[:, 0], values[:, [4, 2, 3]])
+
+
 def test_a_reader_of_another_package(tmp_path, plugin):
     path, values = tmp_path / "raw.npy", table()
     np.save(path, values)

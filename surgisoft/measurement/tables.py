@@ -284,6 +284,12 @@ class DelimitedText:
         text = cell.strip()
         if text in self.missing:
             return np.nan
+        if self.decimal != "." and "." in text:
+            raise InputError(
+                f"{self.path}, line {line}, column {label(self.names, position)}: "
+                f"got {text[:40]!r}, expected a number with a decimal comma and without thousands "
+                'separators, since the map says decimal = ","'
+            )
         text = text.replace(self.decimal, ".")
         if not NUMBER.fullmatch(text):
             raise InputError(

@@ -186,6 +186,16 @@ FILES = [
         'separator = "\\t"\ndecimal = ","',
         "one column only when separated by '\\t'; set separator = \";\" in [file.NAME] of the map",
     ),
+    (
+        "t;u;x;y;z\n0,0;1,5;2;3;4\n1,0;1.234;3;4;5\n",
+        'separator = ";"\ndecimal = ","',
+        "line 3, column 'u': got '1.234', expected a number with a decimal comma and without thous",
+    ),
+    (
+        "t;u;x;y;z\n0,0;1.234,5;2;3;4\n1,0;1,5;3;4;5\n",
+        'separator = ";"\ndecimal = ","',
+        "line 2, column 'u': got '1.234,5', expected a number with a decimal comma and without th",
+    ),
     (RAW, "skip_rows = 9", "fewer than the 9 lines that the map skips"),
     ("\0\1\2" + RAW, "", "not a text file"),
 ]
@@ -287,8 +297,8 @@ def test_command_and_measurement_must_fit(tmp_path):
 @pytest.mark.parametrize(
     ("fields", "expected"),
     [
-        ("scale = [1, 2, 3]", "[measured] scale of the map is [1.0, 2.0, 3.0], expected one number"),
-        ("offset = [1, 2, 3]", "[measured] offset of the map is [1.0, 2.0, 3.0], expected one numb"),
+        ("scale = [1, 2, 3]", "[measured] scale of the map is [1.0, 2.0, 3.0], expected one num"),
+        ("offset = [1, 2, 3]", "[measured] offset of the map is [1.0, 2.0, 3.0], expected one num"),
         (
             'unit = "bar"',
             'columns p1_kPa ... p2_kPa state kPa, but the map unit = "bar" in [measured]',

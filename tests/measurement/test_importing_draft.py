@@ -93,6 +93,23 @@ def test_set_values_are_no_measurements(tmp_path, names, table):
     np.testing.assert_allclose(found.measured, [row[1:3] for row in ROWS])
 
 
+def test_columns_of_one_name_are_drafted_by_their_numbers(tmp_path):
+    path = lab_file(tmp_path, "time_ms,p_bar,p_bar,x_m,y_m,z_m,x_m,y_m,z_m")
+    assert "columns = [2, 3]" in draft_map(path)
+    found = imported(path, tmp_path)
+    np.testing.assert_allclose(found.measured, [row[1:3] for row in ROWS])
+    expected = 1000.0 * np.array([row[3:] for row in ROWS])
+    np.testing.assert_allclose(found.key_points_mm.reshape(-1, 6), expected)
+
+
+def test_a_decimal_comma_below_a_first_row_of_whole_numbers_is_drafted(tmp_path):
+    path = tmp_path / "lab.csv"
+    rows = ["t_s;p_bar;x_mm;y_mm;z_mm", "0;1;0;0;60", "0,05;1,5;0;0;61", "0,1;2;0;0;62"]
+    path.write_text("\n".join(rows) + "\n")
+    assert 'decimal = ","' in draft_map(path)
+    np.testing.assert_allclose(imported(path, tmp_path).t_s, [0.0, 0.05, 0.1])
+
+
 def test_arrays_of_a_matlab_file_are_drafted(tmp_path):
     """Struct fields: two tendons in mm, two markers of three columns each in cm, a repetition."""
     rows = np.array(ROWS, float)

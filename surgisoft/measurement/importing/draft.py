@@ -7,7 +7,7 @@ makes are paths, such as `run1.tip_cm.0` in a MATLAB or HDF5 file.
 
 import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -90,7 +90,7 @@ def draft_map(path: str | Path) -> str:
         if named is None:
             raise
         raise named from error
-    names, label = layout.names, layout.label
+    names = layout.names
     points = [*_key_points(names), *(_key_point_arrays(layout) if layout.paths else [])]
     if not points:
         shown = ", ".join(name for name in names[:12] if name)
@@ -98,14 +98,15 @@ def draft_map(path: str | Path) -> str:
             f"{path}: no columns x, y, z of key points are recognised among {shown or 'unnamed'}; "
             "write the map by hand, docs/recordings.md has one to start from"
         )
-    used = {name for point in points for name in point}
+    labels = [layout.label(name) for name in names]
+    used = {column for point in points for column in point}
     time = next(
-        (n for n in names if TIME.fullmatch(_split(label(n), SECONDS_PER)[0].strip())), None
+        (k for k, n in enumerate(labels) if TIME.fullmatch(_split(n, SECONDS_PER)[0].strip())), None
     )
-    used |= {time} if time else set()
-    rest = [name for name in names if name and name not in used]
-    commanded = [name for name in rest if _is_command(label(name))]
-    measured = [n for n in rest if n not in commanded and _is_actuation(label(n))]
+    used |= set() if time is None else {time}
+    rest = [k for k, name in enumerate(names) if name and k not in used]
+    commanded = [k for k in rest if _is_command(labels[k])]
+    measured = [k for k in rest if k not in commanded and _is_actuation(labels[k])]
     lines = [
         f"# Draft of a map for {path.name}, from the names of its columns. Check every line:",
         "# units, the order of the channels, the key points from base to tip, the frame.",
@@ -118,7 +119,7 @@ def draft_map(path: str | Path) -> str:
     if time is None:
         lines += ["rate_hz = 20.0  # check: no column of time is recognised", ""]
     else:
-        unit = _unit([label(time)], SECONDS_PER, "s")
+        unit = _unit([labels[time]], SECONDS_PER, "s")
         lines += [f"column = {column([time])[0]}", f"unit = {unit}", ""]
     doubt = "" if commanded else "  # check: measured by sensors? Set values are [commanded]"
     if commanded and not measured:
@@ -126,7 +127,7 @@ def draft_map(path: str | Path) -> str:
         doubt = "  # check: set values stand in, no sensor is here; fit with --actuation commanded"
     for table, found in ((f"[measured]{doubt}", measured), ("[commanded]", commanded)):
         if found:
-            unit = _unit([label(n) for n in found], (*ACTUATION_UNITS, *MM_PER), "kPa")
+            unit = _unit([labels[k] for k in found], (*ACTUATION_UNITS, *MM_PER), "kPa")
             lines += [table, f"columns = [{', '.join(column(found))}]", f"unit = {unit}"]
             lines += ['# to = "kPa"  # the unit of your model, if it is another one', ""]
     if not measured and not commanded:
@@ -135,23 +136,21 @@ def draft_map(path: str | Path) -> str:
     lines += [
         "[key_points]  # check: from base to tip",
         f"positions = [{triples}]",
-        f"unit = {_unit([label(name) for point in points for name in point], MM_PER, 'mm')}",
+        f"unit = {_unit([labels[k] for point in points for k in point], MM_PER, 'mm')}",
         "",
         "# [frame]  # check: the recording's z points along the arm at rest, away from the base",
         '# rotation = "x z -y"  # our x is your x, our y your z, our z minus your y',
         '# origin = "k0"',
         "# gravity = [0, -1, 0]  # direction of weight in your frame",
     ]
-    runs = next(
-        (name for name in rest if RUN.fullmatch(label(name)) and name not in commanded), None
-    )
-    if runs:
+    runs = next((k for k in rest if RUN.fullmatch(labels[k]) and k not in commanded), None)
+    if runs is not None:
         lines += [
             "",
             "[runs]  # check: a new value begins a new run",
             f"column = {column([runs])[0]}",
         ]
-    unused = [name for name in rest if name not in (*measured, *commanded, runs)]
+    unused = [names[k] for k in rest if k not in (*measured, *commanded, runs)]
     if unused:
         lines += ["", f"# not used: {', '.join(unused)}"]
     return "\n".join(lines) + "\n"
@@ -193,7 +192,9 @@ def _layout(path: Path) -> _Layout:
             "docs/recordings.md lists the other formats"
         )
     separator, rows, first = best
-    comma = separator != "," and any("," in cell for cell in rows[first])
+    comma = separator != "," and any(
+        "," in cell for row in rows[first:] if _numeric(row) for cell in row
+    )
     above = [k for k in range(first) if any(cell.strip("# ") for cell in rows[k])]
     head = above[-1] if above else None
     units: list[str] = []
@@ -242,10 +243,16 @@ def _split(name: str, units: Iterable[str]) -> tuple[str, str]:
     return name, ""
 
 
-def _key_points(names: Sequence[str]) -> list[tuple[str, str, str]]:
-    """Columns x, y, z of each measured point, in the order of the file."""
+def _key_points(names: Sequence[str]) -> list[tuple[int, int, int]]:
+    """Columns x, y, z of each measured point, counted from 0, in the order of the file.
+
+    Where several columns have one name, the second x belongs to the second y and z.
+    """
+    places: dict[str, list[int]] = {}
+    for k, name in enumerate(names):
+        places.setdefault(name, []).append(k)
     found = []
-    for name in names:
+    for k, name in enumerate(names):
         stem = _split(name, MM_PER)[0]
         for match in AN_X.finditer(stem):
             put = [
@@ -254,18 +261,20 @@ def _key_points(names: Sequence[str]) -> list[tuple[str, str, str]]:
                 + name[match.end() :]
                 for axis in "yz"
             ]
-            if all(other in names for other in put) and not NOT_MEASURED.search(name):
-                found.append((name, put[0], put[1]))
+            if all(other in places for other in put) and not NOT_MEASURED.search(name):
+                nth = places[name].index(k)
+                y, z = (places[other][min(nth, len(places[other]) - 1)] for other in put)
+                found.append((k, y, z))
                 break
     return found
 
 
-def _key_point_arrays(layout: _Layout) -> list[tuple[str, str, str]]:
+def _key_point_arrays(layout: _Layout) -> list[tuple[int, int, int]]:
     """Columns x, y, z of the points in arrays of three columns each, in the order of the file."""
-    arrays: dict[str, list[str]] = {}
-    for name in layout.names:
+    arrays: dict[str, list[int]] = {}
+    for column, name in enumerate(layout.names):
         if A_PLACE.search(name):
-            arrays.setdefault(A_PLACE.sub("", name), []).append(name)
+            arrays.setdefault(A_PLACE.sub("", name), []).append(column)
     found = []
     for array, columns in arrays.items():
         label = layout.label(array)
@@ -300,13 +309,15 @@ def _unit(names: Sequence[str], units: Iterable[str], otherwise: str) -> str:
     return f'"{found[0]}"{more}'
 
 
-def _columns(layout: _Layout):
-    """Function that gives columns as TOML: by name, or by number where names cannot be used."""
+def _columns(layout: _Layout) -> Callable[[Sequence[int]], list[str]]:
+    """Function that gives columns, counted from 0, as TOML: by name, or by number where names
+    cannot be used."""
 
-    def columns(names: Sequence[str]) -> list[str]:
+    def columns(places: Sequence[int]) -> list[str]:
+        names = [layout.names[k] for k in places]
         if layout.header and all(layout.names.count(name) == 1 for name in names):
             return [json.dumps(name, ensure_ascii=False) for name in names]
-        return [str(layout.names.index(name) + 1) for name in names]
+        return [str(k + 1) for k in places]
 
     return columns
 

@@ -75,6 +75,12 @@ def import_(
     from surgisoft.memory import keep_freed_memory
 
     if draft is not None:
+        others = {"-o": output, "--map": map_name, "--dry-run": dry_run, "--model": model}
+        if unused := [option for option, value in others.items() if value]:
+            raise InputError(
+                f"--draft with {' and '.join(unused)}: --draft only writes a draft of a map, "
+                f"expected no {' or '.join(unused)}; import with the map once it is checked"
+            )
         _draft(raw, draft, force)
         return
     if output is None:
@@ -201,6 +207,9 @@ def recording_(
     from surgisoft.memory import keep_freed_memory
 
     keep_freed_memory()
+    others = {"--lerobot-task": task, "--fps": fps}
+    if lerobot is None and (unused := [o for o, value in others.items() if value is not None]):
+        raise InputError(f"{' and '.join(unused)}: for a LeRobotDataset; add --lerobot DIR")
     opened = read_recordings(recordings)
     for recording in opened:
         print(*summary(recording), sep="\n")

@@ -162,6 +162,27 @@ def test_recording_shows_what_it_holds(lab, capsys):
     assert "none.csv: no such file" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "other", [["-o", "rec.csv"], ["--map", "map.toml"], ["--dry-run"], ["--model", "default"]]
+)
+def test_a_draft_takes_no_options_of_an_import(lab, capsys, other):
+    new = lab / "new.toml"
+    assert surgisoft("import", lab / "one.csv", "--draft", new, *other) == 2
+    assert f"--draft with {other[0]}: --draft only writes a draft" in capsys.readouterr().err
+    assert not new.exists()
+
+
+@pytest.mark.parametrize("other", [["--fps", 10], ["--lerobot-task", "Wave."]])
+def test_options_of_a_lerobot_dataset_need_its_folder(lab, capsys, other):
+    out = lab / "rec.csv"
+    surgisoft("import", lab / "one.csv", "--map", lab / "map.toml", "-o", out)
+    capsys.readouterr()
+    assert surgisoft("recording", out, *other) == 2
+    printed = capsys.readouterr()
+    assert f"{other[0]}: for a LeRobotDataset; add --lerobot DIR" in printed.err
+    assert printed.out == ""
+
+
 def test_every_shipped_map_is_valid():
     maps = sorted((DOCS / "examples" / "maps").glob("*.toml"))
     assert len(maps) >= 5

@@ -24,6 +24,7 @@ import torch
 
 import surgisoft
 from surgisoft.agents.presets import Plan, Preset
+from surgisoft.command_line import typed
 from surgisoft.config import POSITIVE, Where, at_least, from_table, to_table, write_toml
 from surgisoft.errors import InputError
 from surgisoft.files import new_folder, read_json, write_atomically
@@ -261,7 +262,7 @@ class RunFolder:
         if not file.is_file():
             raise InputError(
                 f"{file}: there is no such checkpoint yet; continue with 'surgisoft train --resume "
-                f"{self.path}'"
+                f"{typed(self.path)}'"
             )
         try:
             _check_packing(file)

@@ -32,6 +32,7 @@ from surgisoft.cli.options import (
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
+from surgisoft.command_line import typed
 from surgisoft.files import write_json
 
 
@@ -148,11 +149,11 @@ def amend(
     print(result.sentence)
     if saved:
         print(f"wrote {output}: {result.model.summary()}")
-        files = " ".join(map(str, data))
-        following = f"surgisoft diagnose {output} {files}"
+        files = typed(*data)
+        following = f"surgisoft diagnose {typed(output)} {files}"
         if before:
             given = before_options(before, paired)
-            following = f"surgisoft improve {model} {files}{given} -o OTHER"
+            following = f"surgisoft improve {typed(model)} {files}{given} -o OTHER"
         print(f"next, find further effects: {with_effect_files(following)}")
     else:
         print(f"{output} was not written; --anyway writes it nevertheless", flush=True)

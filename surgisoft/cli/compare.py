@@ -27,10 +27,12 @@ from surgisoft.cli.options import (
     Predictions,
     Replay,
     Report,
+    before_options,
     model_options,
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
+from surgisoft.command_line import typed
 from surgisoft.errors import InputError
 from surgisoft.files import write_json
 from surgisoft.progress import text_only
@@ -160,10 +162,10 @@ def compare(
     show_written(written)
     best = min(range(len(compared)), key=lambda i: compared[i].result.rmse_mm)
     if compared[best].result.explainable:
-        names = " ".join(map(str, recordings))
-        since = f" --before {' '.join(map(str, before))}" if before else ""
+        names = typed(*recordings)
+        since = before_options(before, paired)
         since += model_options(predictions, model_error)
-        following = with_effect_files(f"surgisoft diagnose {models[best]} {names}{since}")
+        following = with_effect_files(f"surgisoft diagnose {typed(models[best])} {names}{since}")
         closest = " from the model of the smallest error" if others else ""
         print(f"next, which effect is missing{closest}: {following}")
 

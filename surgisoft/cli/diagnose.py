@@ -34,11 +34,13 @@ from surgisoft.cli.options import (
     Recordings,
     Refit,
     Report,
+    before_files,
     complete_effects,
     model_options,
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
+from surgisoft.command_line import typed
 from surgisoft.errors import InputError
 from surgisoft.files import write_json
 from surgisoft.progress import Progress
@@ -132,12 +134,12 @@ def diagnose(
             error_mm=model_error,
         )
     warn_all(found.notes)
-    data = " ".join(map(str, recordings))
+    data = typed(*recordings)
     # Predictions of `--before` come last.
     of_model = model_options((predictions or [])[: len(measured)], model_error)
     following = ""
     if found.next_command:
-        command = found.command(str(model), data, " ".join(map(str, before or ())))
+        command = found.command(typed(model), data, before_files(before, paired))
         predicted = bool(predictions) or model.suffix in (".csv", ".parquet")
         of_all = model_options(predictions, model_error) if "--before" in command else of_model
         following = _following(command, predicted, of_all)
@@ -159,12 +161,12 @@ def diagnose(
         written.append(replay)
     elif replay:
         warn(f"{replay} was not written: no rows of the same actuation before and after")
-    corrected = str(apply)
+    corrected = typed(apply)
     if apply and found.setup and found.setup.correctable:
         files = save_recordings(found.setup.corrected(measured), apply)
         written.append(apply)
         # Files of predictions belong to recordings by their order, which a folder does not keep.
-        corrected = " ".join(map(str, files)) if predictions and len(files) > 1 else corrected
+        corrected = typed(*files) if predictions and len(files) > 1 else corrected
     _show(found)
     show_written(written)
     if found.setup:
@@ -211,9 +213,9 @@ def _next_after_setup(setup, model: Path, data: str, of_model: str, apply: str |
             print(f"{apply} was not written: this fault cannot be corrected in the recordings")
         print(f"next: {setup.instructions.splitlines()[0]}")
     elif apply:
-        print(f"next: {with_effect_files(f'surgisoft diagnose {model} {apply}{of_model}')}")
+        print(f"next: {with_effect_files(f'surgisoft diagnose {typed(model)} {apply}{of_model}')}")
     else:
-        again = f"surgisoft diagnose {model} {data} --apply CORRECTED{of_model}"
+        again = f"surgisoft diagnose {typed(model)} {data} --apply CORRECTED{of_model}"
         print(f"next: {with_effect_files(again)}")
 
 

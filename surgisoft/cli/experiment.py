@@ -20,6 +20,7 @@ from surgisoft.cli.options import (
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
+from surgisoft.command_line import typed
 from surgisoft.errors import counted
 
 if TYPE_CHECKING:
@@ -91,13 +92,14 @@ def run(
         cluster=cluster,
     )
     with progress(f"experiment {spec.name}") as report:
-        about = f"surgisoft experiment run {file.name}"
+        about = f"surgisoft experiment run {typed(file.name)}"
         try:
             results, files = finish_experiment(
                 spec, folder, processes, replays, about, report, cluster, warn
             )
         except KeyboardInterrupt:
-            again = with_effect_files(f"surgisoft experiment run {file} -o {folder} --resume")
+            again = f"surgisoft experiment run {typed(file)} -o {typed(folder)} --resume"
+            again = with_effect_files(again)
             print(f"stopped; {folder} keeps the finished blocks; continue with: {again}")
             raise typer.Exit(INTERRUPTED) from None
     if context is not None:

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from importlib.util import find_spec
 from pathlib import Path
 
+from surgisoft.command_line import typed
 from surgisoft.errors import InputError
 from surgisoft.files import read_json
 
@@ -93,4 +94,4 @@ def show_written(paths: Iterable[object]) -> None:
 def _how_to_look(path: Path) -> str:
     if path.suffix == ".html":
         return ": open it in a browser"
-    return f": look at it with 'surgisoft replay {path}'" if path.suffix == ".rrd" else ""
+    return f": look at it with 'surgisoft replay {typed(path)}'" if path.suffix == ".rrd" else ""

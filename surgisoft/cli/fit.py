@@ -17,6 +17,7 @@ from surgisoft.cli.options import (
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
+from surgisoft.command_line import typed
 from surgisoft.errors import Interrupted
 
 if TYPE_CHECKING:
@@ -145,11 +146,15 @@ def fit(
         raise typer.Exit(INTERRUPTED)
     moved = any(recording.kind == "continuous" for recording in train)
     if not effects and network == "haw_nn" and moved and above_noise(result.model.validation):
-        files = " ".join(map(str, recordings))
-        files += " --actuation commanded" if actuation == "commanded" else ""
-        again = with_effect_files(f"surgisoft fit {files} --effects auto -o {output}_with_effects")
+        given = f" --valid {typed(*valid)}" if valid else ""
+        given += " --actuation commanded" if actuation == "commanded" else ""
+        new = typed(f"{output}_with_effects")
+        again = f"surgisoft fit {typed(*recordings)}{given} --effects auto -o {new}"
+        again = with_effect_files(again)
         print(f"next, whether the arm has memory that this model lacks: {again}")
-    following = with_effect_files(f"surgisoft compare {output} TEST.parquet --test --report PAGE")
+    following = with_effect_files(
+        f"surgisoft compare {typed(output)} TEST.parquet --test --report PAGE"
+    )
     print(f"next, its error on an unseen recording: {following}")
 
 

@@ -9,6 +9,7 @@ import typer
 from surgisoft.cli import app
 from surgisoft.cli.inputs import IN_A_MAP, check_model, read_recordings, warn
 from surgisoft.cli.options import EffectFiles, Force, Recordings
+from surgisoft.command_line import typed
 from surgisoft.errors import InputError
 
 if TYPE_CHECKING:
@@ -140,7 +141,7 @@ def _draft(raw: list[Path], place: Path, force: bool) -> None:
     write_atomically(place, text)
     checks = text.count("# check:")
     print(f"wrote {place}: a draft; check every line, above all the {checks} marked 'check'")
-    print(f"next: surgisoft import {raw[0]} --map {place} -o REC.parquet --dry-run")
+    print(f"next: surgisoft import {typed(raw[0])} --map {typed(place)} -o REC.parquet --dry-run")
 
 
 def _test_setup(arm: "ArmModel", name: str, recordings: list) -> None:

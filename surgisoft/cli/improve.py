@@ -27,10 +27,12 @@ from surgisoft.cli.options import (
     Refit,
     Replay,
     Report,
+    before_files,
     before_options,
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
+from surgisoft.command_line import typed
 from surgisoft.errors import Interrupted
 from surgisoft.files import write_json
 
@@ -119,10 +121,12 @@ def improve(
         # The model that the last diagnosis is of, if it is written.
         last = output if result.claimed else model
         # What was amended to a change is not compared with the recordings from before it again.
-        earlier_files = () if result.claimed else before or ()
-        given = (" ".join(map(str, some)) for some in (recordings, earlier_files))
+        earlier_files = None if result.claimed else before
+        given = (typed(*recordings), before_files(earlier_files, paired))
         found = result.diagnoses[-1]
-        command = with_effect_files(found.command(str(last), *given)) if found.next_command else ""
+        command = (
+            with_effect_files(found.command(typed(last), *given)) if found.next_command else ""
+        )
         written += write_improve_report(result, tables, report, title, command)
     if replay:
         written.append(write_before_and_after(result, tables, model.name, replay))
@@ -134,15 +138,15 @@ def improve(
         raise typer.Exit(INTERRUPTED if result.interrupted else NOT_CLAIMED)
     print(f"wrote {output}: {result.model.summary()}")
     if result.interrupted:
-        files = " ".join(map(str, recordings))
-        start = model if before else output
+        files = typed(*recordings)
+        start = typed(model if before else output)
         again = f"surgisoft improve {start} {files}{before_options(before, paired)} -o OTHER"
         following = with_effect_files(again)
         print(f"next, to seek further effects: {following}")
         raise typer.Exit(INTERRUPTED)
     known = result.model.fitted_rows
     test = "TEST.parquet --test" if known is not None and known.complete else "TEST.parquet"
-    following = with_effect_files(f"surgisoft compare {model} {output} {test} --report PAGE")
+    following = with_effect_files(f"surgisoft compare {typed(model, output)} {test} --report PAGE")
     print(f"next, both models on an unseen recording: {following}")
 
 

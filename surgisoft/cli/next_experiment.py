@@ -24,6 +24,7 @@ from surgisoft.cli.options import (
 )
 from surgisoft.cli.options import Rig as RigOption
 from surgisoft.cli.progress import progress
+from surgisoft.command_line import typed
 from surgisoft.errors import InputError
 from surgisoft.files import write_atomically, write_json
 
@@ -142,7 +143,7 @@ def _compared(before: list[Path] | None, paired: bool) -> str:
     """
     if not before:
         return ""
-    return f" --before {' '.join(map(str, before))}" + (" --paired never" if paired else "")
+    return f" --before {typed(*before)}" + (" --paired never" if paired else "")
 
 
 def _show(
@@ -168,20 +169,21 @@ def _show(
             "between its rows"
         )
     if other and not record:
-        print(f"  on the rig: surgisoft collect {output} --rig {rig} -o {new}")
+        print(f"  on the rig: surgisoft collect {typed(output)} --rig {typed(rig)} -o {typed(new)}")
     elif not other and (result.protocol.commands.shape[1], result.protocol.unit) == ON_RIG:
         options = f" {result.options}" if result.options else ""
-        place = "" if rig == VIRTUAL else f" --rig {rig}"
+        place = "" if rig == VIRTUAL else f" --rig {typed(rig)}"
         if result.by_hand:
             if named:
                 print("  the virtual rig has no option for that change")
             print("  --as-it-stands proposes an experiment without a change of the bench")
         elif not record:
-            print(f"  on the virtual rig: surgisoft collect {output}{place}{options} -o {new}")
+            played = f"surgisoft collect {typed(output)}{place}{options} -o {typed(new)}"
+            print(f"  on the virtual rig: {played}")
     # After a change that removes an effect, only the new recording counts.
-    old = "" if result.by_hand else "".join(f" {path}" for path in recordings)
+    old = "" if result.by_hand else "".join(f" {typed(path)}" for path in recordings)
     taken = f" --without {' '.join(result.removes)}" if result.by_hand else ""
-    following = f"surgisoft diagnose {model}{old} {new}{taken}{of_model}"
+    following = f"surgisoft diagnose {typed(model)}{old} {typed(new)}{taken}{of_model}"
     print(f"  then: {with_effect_files(following)}")
     pairs = sorted(result.pairs, key=lambda pair: pair.after)
     open_ = [pair for pair in pairs if pair.effects not in result.separates]
@@ -207,22 +209,20 @@ def _record(result, rig: str, schedule: Path, record: Path, force: bool) -> None
     """
     from surgisoft.rig.registry import parse_rig, rig_options
 
+    command = f"surgisoft collect {typed(schedule)} --rig {typed(rig)} -o {typed(record)}"
     setup: dict[str, Any] = dict(result.rig_options)
     known = rig_options(parse_rig(rig).name)
     lacking = [name for name in setup if name not in known or name in parse_rig(rig).options]
     if result.by_hand or lacking:
         raise InputError(
             f"{schedule} is written, {record} is not: first {result.steps[0]}; then "
-            f"'surgisoft collect {schedule} --rig {rig} -o {record}' (--as-it-stands proposes no "
+            f"'{command}' (--as-it-stands proposes no "
             "change of the experimental setup)"
         )
     try:
         recording = record_on(schedule, rig, record, force, **setup)
     except InputError as error:
-        raise InputError(
-            f"{error}. {schedule} is written; to record it: 'surgisoft collect {schedule} --rig "
-            f"{rig} -o {record}'"
-        ) from error
+        raise InputError(f"{error}. {schedule} is written; to record it: '{command}'") from error
     from surgisoft.measurement.recordings import save_recording
 
     save_recording(recording, record, force)

@@ -1,12 +1,14 @@
 """Arguments and options that several commands share: one name, metavar and help text for each."""
 
 import os
+import shlex
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Literal
 
 from typer import Argument, Option
 
+from surgisoft.command_line import typed
 from surgisoft.errors import InputError
 
 SEED_MAX = 2**31
@@ -147,23 +149,28 @@ def with_effect_files(command: str) -> str:
     from surgisoft.surrogate.effects import registered_files
 
     files = registered_files()
-    named = [name for name in named_callables() if name not in command.split()]
-    effects = f" --effect-file {' '.join(files)}" if files else ""
-    return command + effects + (f" --model-code {' '.join(named)}" if named else "")
+    named = [name for name in named_callables() if name not in shlex.split(command)]
+    effects = f" --effect-file {typed(*files)}" if files else ""
+    return command + effects + (f" --model-code {typed(*named)}" if named else "")
+
+
+def before_files(before: list[Path] | None, paired: str) -> str:
+    """What follows `--before` in a command to run next: the recordings, and how to pair them, as
+    this call was given them; empty without recordings."""
+    if not before:
+        return ""
+    return typed(*before) + ("" if paired == "auto" else f" --paired {paired}")
 
 
 def before_options(before: list[Path] | None, paired: str) -> str:
     """The options of a command to run next about recordings from before a change, as this call was
     given them."""
-    if not before:
-        return ""
-    text = f" --before {' '.join(map(str, before))}"
-    return text if paired == "auto" else f"{text} --paired {paired}"
+    return f" --before {before_files(before, paired)}" if before else ""
 
 
 def model_options(predictions: list[Path] | None, error_mm: float | None) -> str:
     """The options of a command to run next that say what MODEL is, as this call was given them."""
-    text = f" --predictions {' '.join(map(str, predictions))}" if predictions else ""
+    text = f" --predictions {typed(*predictions)}" if predictions else ""
     return text if error_mm is None else f"{text} --model-error {error_mm:g}"
 
 

@@ -21,8 +21,10 @@ from surgisoft.cli.options import (
     Rig,
     TaskConfig,
     Web,
+    with_effect_files,
 )
 from surgisoft.cli.progress import progress
+from surgisoft.command_line import typed
 from surgisoft.errors import InputError
 from surgisoft.files import write_json
 
@@ -166,8 +168,9 @@ def run(
     show_written(path for path in (*found.written, replay, json_file) if path is not None)
     if found.alarms:
         name = model or "default"
-        past = f" --before {' '.join(map(str, before))}" if before else ""
-        print(f"next: surgisoft diagnose {name} {found.written[-1]}{past}")
+        past = f" --before {typed(*before)}" if before else ""
+        following = f"surgisoft diagnose {typed(name, found.written[-1])}{past}"
+        print(f"next: {with_effect_files(following)}")
     if found.ended_by is not None:
         raise found.ended_by
 

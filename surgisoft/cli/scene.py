@@ -9,6 +9,7 @@ from surgisoft.cli import app
 from surgisoft.cli.files import check_folder, show_written
 from surgisoft.cli.options import EffectFiles, Force, Port, SaveReplay, Screenshot, Web
 from surgisoft.cli.progress import progress
+from surgisoft.command_line import typed
 from surgisoft.errors import InputError
 
 commands = typer.Typer(help="Make, check and view surgical scenes.", no_args_is_help=True)
@@ -152,7 +153,7 @@ def new(
     for note in made.notes:
         print(note)
     _print_check(made.check)
-    print(f"wrote {output}: view it with 'surgisoft scene show {output}'")
+    print(f"wrote {output}: view it with 'surgisoft scene show {typed(output)}'")
     return 0
 
 

@@ -18,6 +18,7 @@ from surgisoft.cli.options import (
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
+from surgisoft.command_line import typed
 from surgisoft.errors import InputError
 
 OPTIONS = {
@@ -210,14 +211,14 @@ def train(
     if not run.result.done:
         print(
             f"stopped after {run.result.steps:,} steps; continue with: "
-            f"{with_effect_files(f'surgisoft train --resume {run.folder}')}"
+            f"{with_effect_files(f'surgisoft train --resume {typed(run.folder)}')}"
         )
         raise typer.Exit(INTERRUPTED)
     print(_summary(run.folder, run.result))
     if why := shortfall(run):
         warn(why)
-    print(f"next: {with_effect_files(f'surgisoft evaluate {run.folder}')}")
-    print(f"an episode of its last evaluation: surgisoft replay {run.folder}")
+    print(f"next: {with_effect_files(f'surgisoft evaluate {typed(run.folder)}')}")
+    print(f"an episode of its last evaluation: surgisoft replay {typed(run.folder)}")
 
 
 def _measures(found: dict | None) -> str:

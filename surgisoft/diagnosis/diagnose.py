@@ -331,6 +331,7 @@ class Diagnosis:
     ) -> str:
         """`next_command` with its files, in words for those that are not given.
 
+        model, data, before: as they are typed in a shell (`surgisoft.command_line.typed`).
         before: the recordings from before, which are left out where none were compared, or empty.
         """
         option = f" --before {before}" if self.change is not None and before else ""

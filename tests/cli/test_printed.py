@@ -2,6 +2,8 @@
 
 import html
 import re
+import shlex
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -808,3 +810,78 @@ def test_fields_are_completed_for_the_task_that_is_named(
         run([])
     assert ended.value.code == 0
     assert capsys.readouterr().out.split() == expected
+
+
+def words_of(line: str) -> list[str]:
+    """The words of the command at the end of a line, as a shell reads them."""
+    return shlex.split(line[line.index("surgisoft ") :])
+
+
+@pytest.fixture
+def spaced(bench, tmp_path):
+    """A recording in a folder whose name holds a space."""
+    (tmp_path / "my bench").mkdir()
+    return str(shutil.copy(bench / "bench.parquet", tmp_path / "my bench" / "a b.parquet"))
+
+
+def fitted(monkeypatch, noise_mm: float | None = 0.1) -> None:
+    """A fit whose model is far above the noise of the cameras, and is not written."""
+    found = SimpleNamespace(
+        model=SimpleNamespace(summary=lambda: "an arm", validation=Validation(1.0, noise_mm)),
+        report=dict, lines=lambda: (), interrupted=None,
+    )  # fmt: skip
+    monkeypatch.setattr("surgisoft.measurement.fitting.fit", lambda *_, **__: found)
+    monkeypatch.setattr("surgisoft.surrogate.checkpoint.save_model", lambda *_: None)
+
+
+def test_after_a_fit_the_advice_keeps_the_validation_recordings(spaced, capsys, monkeypatch):
+    fitted(monkeypatch)
+    new = str(Path(spaced).with_name("new arm"))
+    assert run(["fit", spaced, "--valid", spaced, spaced, "-o", new]) == 0
+    memory, error = capsys.readouterr().out.splitlines()[-2:]
+    assert words_of(memory) == [
+        "surgisoft", "fit", spaced, "--valid", spaced, spaced, "--effects", "auto", "-o",
+        f"{new}_with_effects",
+    ]  # fmt: skip
+    assert words_of(error)[:4] == ["surgisoft", "compare", new, "TEST.parquet"]
+    assert run(["fit", spaced, "-o", new]) == 0
+    assert "--valid" not in capsys.readouterr().out
+
+
+def test_printed_commands_quote_paths_with_spaces(spaced, capsys, monkeypatch):
+    folder = Path(spaced).parent
+    new = str(folder / "new arm")
+    monkeypatch.setattr("surgisoft.surrogate.checkpoint.save_model", lambda *_: None)
+
+    def last(*command: str) -> list[str]:
+        assert run(list(command)) == 0
+        return words_of(capsys.readouterr().out.splitlines()[-1])
+
+    found = diagnosis(next_command="surgisoft compare {model} {data}{before}", change=CHANGE)
+    monkeypatch.setattr("surgisoft.diagnosis.diagnose.diagnose", lambda *_, **__: found)
+    given = ["default", spaced, "--before", spaced, "--paired", "never"]
+    assert last("diagnose", *given) == ["surgisoft", "compare", *given]
+    one = [comparison("default", explainable=0.5)]
+    monkeypatch.setattr("surgisoft.diagnosis.compare.compare_all", lambda *_, **__: one)
+    assert last("compare", *given) == ["surgisoft", "diagnose", *given]
+    amended = result(
+        claimed=True, rounds=[], steps=[], parameters=[], effects=("creep",), refitted=(),
+        in_words={}, retuned=False, refit=None, sentence="the error falls", diagnoses=[],
+        model=SimpleNamespace(summary=lambda: "an arm", fitted_rows=None),
+    )  # fmt: skip
+    for name in ("amend.amend", "improve.improve"):
+        monkeypatch.setattr(f"surgisoft.diagnosis.{name}", lambda *_, **__: amended)
+    amend = ["amend", "default", "--effect", "creep", "--data", spaced, "-o", new]
+    assert last(*amend) == ["surgisoft", "diagnose", new, spaced]
+    assert last("improve", "default", spaced, "-o", new)[2:4] == ["default", new]
+    alarm = live(alarms=(SimpleNamespace(since_s=4.0),), written=(spaced,))
+    monkeypatch.setattr("surgisoft.live.session.run", lambda *_, **__: alarm)
+    again = ["default", spaced, "--before", spaced]
+    assert last(*RUN, "--before", spaced) == ["surgisoft", "diagnose", *again]
+    (folder / "raw log.csv").write_text("t_s,p1_kPa,x_mm,y_mm,z_mm\n0,1,0,0,50\n1,2,0,0,50\n")
+    raw, draft = str(folder / "raw log.csv"), str(folder / "my map.toml")
+    following = last("import", raw, "--draft", draft)
+    assert following[:5] == ["surgisoft", "import", raw, "--map", draft]
+    assert run(["import", raw, "-o", new]) == 2
+    said = capsys.readouterr().err
+    assert f"'surgisoft import {shlex.quote(raw)} --draft map.toml' writes one" in said

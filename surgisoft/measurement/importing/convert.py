@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from surgisoft.command_line import typed
 from surgisoft.errors import InputError
 from surgisoft.measurement.importing.align import Joined, join
 from surgisoft.measurement.importing.names import check_columns, uses
@@ -103,7 +104,7 @@ def import_recordings(
         return _named_apart([import_log(path, name or path.stem) for path in paths])
     if paths and all(is_dataset(path) for path in paths):
         return _named_apart([import_lerobot(path, name or path.name) for path in paths])
-    first = f" {paths[0]}" if paths else ""
+    first = f" {typed(paths[0])}" if paths else ""
     raise InputError(
         "--map is missing: a map file states columns, units and frames; "
         f"'surgisoft import{first} --draft map.toml' writes one to start from"

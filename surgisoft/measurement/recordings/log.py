@@ -20,6 +20,7 @@ from typing import Annotated, Any, TextIO
 
 import numpy as np
 
+from surgisoft.command_line import typed
 from surgisoft.config import Where, at_least, describe, from_table
 from surgisoft.errors import InputError
 from surgisoft.files import json_safe
@@ -163,7 +164,7 @@ def check_log_free(path: Path, force: bool = False) -> None:
     if path.exists() and not force:
         raise InputError(
             f"{path}: the log of an interrupted recording is there; use it ('surgisoft recording "
-            f"{path}' reads it), remove it, or use --force (in Python force=True)"
+            f"{typed(path)}' reads it), remove it, or use --force (in Python force=True)"
         )
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from surgisoft.command_line import typed
 from surgisoft.errors import AssumptionWarning, InputError
 from surgisoft.scene.folder import Scene, open_scene
 from surgisoft.scene.spec import MountSpec
@@ -404,7 +405,7 @@ def _check_length(model: ArmModel, mount: MountSpec, scene: Scene, arm: str | Pa
     raise InputError(
         f"arm '{arm}' is {length:g} mm long, and the scene '{scene.spec.name}' mounts an arm of "
         f"{mount.length_mm:g} mm as the {mount.tool}; make a scene for it: surgisoft scene new "
-        f"MESH --arm {arm} -o DIR"
+        f"MESH --arm {typed(arm)} -o DIR"
     )
 
 

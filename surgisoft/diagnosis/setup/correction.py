@@ -1,5 +1,6 @@
 """The correction of a set-up: applied to a recording, or as the lines of an import's map."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,6 +18,8 @@ from surgisoft.measurement.units import SECONDS_PER
 LEAST_ALIKE = 0.05
 """Least gain of the correlation with the corrected measurement for which a command is corrected
 too [-]."""
+ORIGIN_DIGITS = 4
+"""Digits behind the point of an origin in mm in a map; one in a larger unit has more."""
 ROUNDED = 6
 """Digits behind the point of a rotation in a map."""
 
@@ -134,7 +137,9 @@ class Correction:
             unit = next((u for u, s in SECONDS_PER.items() if s == self.time_factor), None)
             time = {"column": "t_s"} | ({"unit": unit} if unit else {"scale": self.time_factor})
         measured: dict[str, Any] = {}
-        if given.order != tuple(range(len(given.order))) or self.from_command:
+        moved = given.order != tuple(range(len(given.order)))
+        if moved or self.from_command or given.factor != 1.0:
+            # Columns that are found by their names have the unit that their names state.
             measured["columns"] = [
                 f"{'c' if k in self.from_command else 'p'}{k + 1}_{self.unit}" for k in given.order
             ]
@@ -142,7 +147,7 @@ class Correction:
         if any(sign != 1.0 for sign in given.sign):
             measured["scale"] = list(given.sign)
         if given.factor != 1.0:
-            measured["unit"], measured["to"] = self.recorded_unit, self.unit
+            measured["to"] = self.unit
         if self.delay_s:
             measured["delay_s"] = round(self.delay_s, 4)
         key_points: dict[str, Any] = {}
@@ -157,7 +162,8 @@ class Correction:
             key_points |= {"unit": unit} if unit else {"scale": self.mm_per_unit}
         frame: dict[str, Any] = {}
         if self.origin_mm is not None:
-            frame["origin"] = [round(float(v) / self.mm_per_unit, 4) for v in self.origin_mm]
+            digits = ORIGIN_DIGITS + max(0, math.ceil(math.log10(self.mm_per_unit)))
+            frame["origin"] = [round(float(v) / self.mm_per_unit, digits) for v in self.origin_mm]
         if self.rotation is not None:
             frame["rotation"] = _rotation(self.rotation)
             if np.linalg.det(self.rotation) < 0:

@@ -11,6 +11,7 @@ from surgisoft.cli.inputs import IN_A_MAP, check_model, read_recordings, warn
 from surgisoft.cli.options import EffectFiles, Force, Recordings
 from surgisoft.command_line import typed
 from surgisoft.errors import InputError
+from surgisoft.files import resolved
 
 if TYPE_CHECKING:
     from surgisoft.surrogate.model import ArmModel
@@ -105,6 +106,8 @@ def import_(
         from surgisoft.measurement.histories import check_fits
 
         check_fits(arm.spec, [part.recording for part in parts], sized=False)
+    given = [Path(map_name)] if map_name else []
+    _check_kept([*given, *(file for part in parts for file in part.files)], targets)
     for target in targets if not dry_run else []:
         check_writable(target, force)
     if not dry_run:
@@ -120,6 +123,21 @@ def import_(
         print(f"{'would write' if dry_run else 'wrote'} {target}: {about}", *rest, sep="\n")
     if arm:
         _test_setup(arm, str(model), [part.recording for part in parts])
+
+
+def _check_kept(read: list[Path], targets: list[Path]) -> None:
+    """Raise where a recording or its sidecar would replace a file that it is made from."""
+    from surgisoft.measurement.recordings.sidecar import sidecar_of
+
+    kept = {resolved(file): file for file in read}
+    for target in targets:
+        for place in (target, sidecar_of(target)):
+            if resolved(place) in kept:
+                what = "" if place == target else f"is the sidecar of {target} and "
+                raise InputError(
+                    f"{place}: {what}is read by this import, expected a new file; choose another "
+                    "name with -o"
+                )
 
 
 def _draft(raw: list[Path], place: Path, force: bool) -> None:

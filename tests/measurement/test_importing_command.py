@@ -162,6 +162,18 @@ def test_recording_shows_what_it_holds(lab, capsys):
     assert "none.csv: no such file" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("output", "kept"), [("one.csv", "one.csv"), ("map.parquet", "map.toml")])
+def test_what_an_import_reads_is_not_replaced_even_by_force(lab, capsys, output, kept):
+    before = (lab / kept).read_bytes()
+    given = ["import", lab / "one.csv", "--map", lab / "map.toml", "-o", lab / output, "--force"]
+    assert surgisoft(*given) == 2
+    printed = capsys.readouterr().err
+    assert f"{lab / kept}: " in printed
+    assert "is read by this import, expected a new file" in printed
+    assert (lab / kept).read_bytes() == before
+    assert sorted(path.name for path in lab.iterdir()) == ["map.toml", "one.csv", "two.csv"]
+
+
 @pytest.mark.parametrize(
     "other", [["-o", "rec.csv"], ["--map", "map.toml"], ["--dry-run"], ["--model", "default"]]
 )

@@ -201,6 +201,7 @@ def test_runs_have_a_command_if_each_of_their_files_has_one(tmp_path):
     (part,) = run(tmp_path, [both, lacking], content)
     assert part.recording.commanded is None
     assert part.recording.samples == 6
+    assert "the command is left out of all runs, because b has none" in part.notes
 
 
 def test_number_of_files_must_fit(tmp_path):

@@ -68,6 +68,8 @@ class Imported:
     """The recording, not yet saved."""
     notes: list[str]
     """What was left out, joined or fitted, in words."""
+    files: tuple[Path, ...] = ()
+    """The files that it was read from."""
 
 
 def import_files(paths: Sequence[Path], spec: ImportMap, name: str | None) -> list[Imported]:
@@ -114,7 +116,7 @@ def import_recordings(
 def import_log(path: Path, name: str) -> Imported:
     """The recording in a log of a recording, such as one that was interrupted; it needs no map."""
     recording, lacking = read_log(path)
-    return Imported(replace(recording, name=name), [lacking] if lacking else [])
+    return Imported(replace(recording, name=name), [lacking] if lacking else [], (path,))
 
 
 def import_lerobot(folder: Path, name: str) -> Imported:
@@ -248,7 +250,8 @@ def _import_set(files: dict[str, Path], spec: ImportMap) -> Imported:
     )
     draft, notes = tidy(draft, spec, joined.main.cells.place)
     recording = _recording(draft, spec, measured.to or measured.unit, placed.gravity, joined)
-    return Imported(recording, [*said, *joined.notes, *placed.notes, *notes])
+    notes = [*said, *joined.notes, *placed.notes, *notes]
+    return Imported(recording, notes, tuple(files.values()))
 
 
 def _other_unit_than_stated(spec: ImportMap, table: RawTable) -> list[str]:
@@ -452,7 +455,16 @@ def _as_runs(parts: list[Imported], spec: ImportMap, name: str) -> Imported:
     changed: dict[str, Any] = {"commanded": None, "gravity": _common_gravity(recordings)}
     whole = replace(first, name=name, run=run, **(changed | stacked))
     notes = [f"{p.recording.name}: {n}" if len(parts) > 1 else n for p in parts for n in p.notes]
-    return Imported(whole, notes)
+    notes = [*_left_out_of_runs(recordings), *notes]
+    return Imported(whole, notes, tuple(file for part in parts for file in part.files))
+
+
+def _left_out_of_runs(recordings: list[Recording]) -> list[str]:
+    """A note where some files have a command and others none: then no run of the recording has."""
+    lacking = [recording.name for recording in recordings if recording.commanded is None]
+    if len(lacking) in (0, len(recordings)):
+        return []
+    return [f"the command is left out of all runs, because {', '.join(lacking)} has none"]
 
 
 def _common_gravity(recordings: list[Recording]) -> np.ndarray | None:
@@ -488,4 +500,5 @@ def _finished(part: Imported, spec: ImportMap) -> Imported:
     notes = [*notes, *plausibility_notes(recording, spec.key_points.unit, time_unit)]
     if spec.runs.gap_s is None and (found := gaps_in_words(recording)):
         notes = [*notes, found]
-    return Imported(recording, [*notes, *timing_notes(recording, spec.measured.delay_s)])
+    notes = [*notes, *timing_notes(recording, spec.measured.delay_s)]
+    return replace(part, recording=recording, notes=notes)

@@ -111,6 +111,10 @@ def diagnose(
     check_model(model, predictions)
     measured = read_recordings(recordings)
     earlier = read_before(before, paired)
+    if apply:
+        from surgisoft.measurement.recordings import check_names_differ
+
+        check_names_differ(measured)
 
     from surgisoft.diagnosis.diagnose import diagnose as diagnose_model
     from surgisoft.measurement.recordings import save_recordings

@@ -82,7 +82,7 @@ class SetupResult:
     floor_mm: float
     """Noise floor, mm."""
     recordings: tuple[str, ...]
-    """Names of the recordings that it holds for."""
+    """Names of the recordings that it holds for; their files where several have one name."""
     correctable: bool
     """Whether the recordings can be corrected without recording again."""
     correction: Correction
@@ -96,8 +96,8 @@ class SetupResult:
     def corrected(self, recordings: Sequence[Recording]) -> list[Recording]:
         """The recordings; those that have the faults are corrected."""
         return [
-            self.correction.applied(recording) if recording.name in self.recordings else recording
-            for recording in recordings
+            self.correction.applied(recording) if name in self.recordings else recording
+            for recording, name in zip(recordings, _called(recordings), strict=True)
         ]
 
     def to_json(self) -> dict[str, Any]:
@@ -135,20 +135,30 @@ def find_setup_faults(model: ArmModel, recordings: Sequence[Recording]) -> Setup
     measured = [r for r in recordings if np.isfinite(r.key_points_mm).any()]
     if not measured:
         return None
+    called = {id(r): name for r, name in zip(recordings, _called(recordings), strict=True)}
+
+    def named(result: SetupResult, some: list[Recording]) -> SetupResult:
+        return replace(result, recordings=tuple(called[id(each)] for each in some))
+
     found = _of_one_setup(model, measured)
-    if found is not None or len(measured) == 1:
-        return found
-    alone = {}
-    for recording in measured[:MOST_APART]:
-        result = _of_one_setup(model, [recording])
-        if result is not None:
-            alone[recording.name] = result
+    if found is not None:
+        return named(found, measured)
+    if len(measured) == 1:
+        return None
+    results = [(each, _of_one_setup(model, [each])) for each in measured[:MOST_APART]]
+    alone = [(each, result) for each, result in results if result is not None]
     if not alone:
         return None
-    first = next(iter(alone.values()))
-    same = [name for name, result in alone.items() if result.kinds == first.kinds]
-    together = _of_one_setup(model, [each for each in measured if each.name in same])
-    return together or first
+    one, first = alone[0]
+    same = [each for each, result in alone if result.kinds == first.kinds]
+    together = _of_one_setup(model, same) if same[1:] else first
+    return named(together, same) if together else named(first, [one])
+
+
+def _called(recordings: Sequence[Recording]) -> list[str]:
+    """The names of recordings; in place of a name that several have, their files."""
+    names = [recording.name for recording in recordings]
+    return [each.name if names.count(each.name) == 1 else each.label for each in recordings]
 
 
 def _levels(model: ArmModel, recordings: list[Recording]) -> Levels:

@@ -5,6 +5,7 @@ The file format is described in docs/recordings.md.
 
 from surgisoft.measurement.recordings.file import (
     after_alarm,
+    check_names_differ,
     check_writable,
     load_recording,
     load_recordings,
@@ -29,6 +30,7 @@ __all__ = [
     "QualityWarning",
     "Recording",
     "after_alarm",
+    "check_names_differ",
     "check_rows",
     "check_same_arm",
     "check_writable",

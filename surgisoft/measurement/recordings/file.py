@@ -316,17 +316,26 @@ def save_recordings(recordings: Iterable[Recording], folder: str | Path) -> list
     folder, recordings = Path(folder), list(recordings)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: exists already, expected a new folder; choose another one")
-    names = [recording.name for recording in recordings]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise InputError(f"two recordings are called '{twice}', expected names that differ")
+    check_names_differ(recordings)
     try:
         with new_folder(folder) as fresh:
             for recording in recordings:
                 save_recording(recording, fresh / f"{recording.name}.parquet")
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror or error})") from error
-    return [folder / f"{name}.parquet" for name in names]
+    return [folder / f"{recording.name}.parquet" for recording in recordings]
+
+
+def check_names_differ(recordings: Iterable[Recording]) -> None:
+    """Raise InputError where two recordings have one name, so that one folder cannot hold both."""
+    first: dict[str, Recording] = {}
+    for recording in recordings:
+        if (other := first.get(recording.name)) is not None:
+            raise InputError(
+                f"two recordings are called '{recording.name}' ({other.label}, {recording.label}), "
+                "expected names that differ; rename a file, or give them one by one"
+            )
+        first[recording.name] = recording
 
 
 def _write_table(content: pa.Table, part: Path, suffix: str) -> None:

@@ -140,6 +140,25 @@ def test_apply_writes_what_is_mended_and_nothing_else(folder, capsys):
     assert not capsys.readouterr().out.startswith("setup")
 
 
+def test_one_of_two_recordings_of_one_name_is_corrected_but_not_written(folder, capsys):
+    """Their files tell them apart; a folder cannot hold both, which is said before the work."""
+    wrong, right = folder / "wrong" / "rec.parquet", folder / "right" / "rec.parquet"
+    for source, place in (("day2", wrong), ("day1", right)):
+        place.parent.mkdir()
+        save_recording(load_recording(folder / f"{source}.parquet"), place)
+    both = [load_recording(place) for place in (right, wrong)]
+    found = find_setup_faults(default_arm(), both)
+    assert found.recordings == (str(wrong),)
+    fine, corrected = found.corrected(both)
+    np.testing.assert_array_equal(fine.key_points_mm, both[0].key_points_mm)
+    assert np.abs(corrected.key_points_mm - both[0].key_points_mm).max() < 0.1
+    out = folder / "corrected"
+    given = ["diagnose", "default", str(right), str(wrong), "--apply", str(out)]
+    assert run([*given, "--json", str(folder / "found.json")]) == 2
+    assert f"two recordings are called 'rec' ({right}, {wrong})" in capsys.readouterr().err
+    assert not (folder / "found.json").exists()
+
+
 def test_apply_replaces_nothing(folder, capsys):
     given = ["diagnose", "default", str(folder / "day2.parquet"), "--apply", str(folder)]
     assert run(given) == 2

@@ -164,7 +164,8 @@ def test_runs_of_one_recording_have_one_unit(tmp_path):
         path = tmp_path / f"{one}{other}.csv"
         files[one, other] = written(path, text(values, header=header))
     in_kpa, in_psi, mixed = files.values()
-    (part,) = run(tmp_path, [in_kpa, in_kpa], content)
+    again = written(tmp_path / "again.csv", in_kpa.read_bytes())
+    (part,) = run(tmp_path, [in_kpa, again], content)
     assert part.recording.unit == "kPa"
     with pytest.raises(InputError, match=r"2 channels in psi and .* expected 2 in kPa and 2"):
         run(tmp_path, [in_kpa, in_psi], content)
@@ -196,12 +197,22 @@ def test_runs_have_a_command_if_each_of_their_files_has_one(tmp_path):
     lacking = written(tmp_path / "b.csv", text(values, header=["t", "u", "x", "y", "w", "z"]))
     content = ONE.replace("ROWS", "").replace('["x", "y", "z"], ', "")
     content = content.replace("KEYS", "[commanded]")
-    (part,) = run(tmp_path, [both, both], content)
+    again = written(tmp_path / "again.csv", both.read_bytes())
+    (part,) = run(tmp_path, [both, again], content)
     np.testing.assert_array_equal(part.recording.commanded[:, 0], [5, 11, 17, 5, 11, 17])
     (part,) = run(tmp_path, [both, lacking], content)
     assert part.recording.commanded is None
     assert part.recording.samples == 6
     assert "the command is left out of all runs, because b has none" in part.notes
+
+
+def test_a_file_that_is_given_twice_is_no_second_run(tmp_path):
+    values = np.arange(18.0).reshape(3, 6)
+    path = written(tmp_path / "a.csv", text(values, header=["t", "u", "x", "y", "w", "z"]))
+    content = ONE.replace("ROWS", "").replace('["x", "y", "z"], ', "").replace("KEYS", "")
+    for twice in ([path, path], [tmp_path, path]):
+        with pytest.raises(InputError, match=r"a\.csv: given 2 times, .* expected each raw file"):
+            run(tmp_path, twice, content)
 
 
 def test_number_of_files_must_fit(tmp_path):

@@ -16,6 +16,7 @@ import numpy as np
 
 from surgisoft.command_line import typed
 from surgisoft.errors import InputError
+from surgisoft.files import resolved
 from surgisoft.measurement.importing.align import Joined, join
 from surgisoft.measurement.importing.names import check_columns, uses
 from surgisoft.measurement.importing.plausible import plausibility_notes
@@ -174,6 +175,13 @@ def _files(paths: Sequence[Path], spec: ImportMap) -> list[Path]:
             raise InputError(f"{path}: no such file, expected a raw file to import")
     if not found:
         raise InputError("no raw file given, expected at least one")
+    places = [resolved(path) for path in found]
+    for path, place in zip(found, places, strict=True):
+        if places.count(place) > 1:
+            raise InputError(
+                f"{path}: given {places.count(place)} times, alone or in a folder, expected each "
+                "raw file once: a repeated one would count as another run"
+            )
     return found
 
 

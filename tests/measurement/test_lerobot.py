@@ -51,6 +51,16 @@ def test_recording_returns_as_it_was(tmp_path):
     np.testing.assert_array_equal(read.gravity, [0, 0, 1])
 
 
+def test_context_that_a_dataset_does_not_hold_is_told(tmp_path):
+    made = replace(recording(), payload_g=np.full(40, 5.0))
+    made.temp_C[0] = np.nan
+    notes = save_lerobot([made], tmp_path / "set")
+    read = load_lerobot(tmp_path / "set")
+    assert (read.temp_C, read.payload_g) == (None, None)
+    assert "temp_C of two_runs has gaps and is left out" in notes
+    assert "payload_g of two_runs is no value of a dataset and is left out" in notes
+
+
 def test_action_is_the_command_after_the_observation(tmp_path):
     made = recording()
     save_lerobot([made], tmp_path / "set", task="Bend.")

@@ -127,6 +127,7 @@ def save_lerobot(
     if lost:
         total = sum(len(e.state) for e in episodes)
         notes.append(f"{lost} of {total} frames lack a key point (NaN); a policy cannot take them")
+    notes += _left_out(recordings, names[STATE])
     with new_folder(folder) as draft:
         _write(draft, episodes, names, rate, task)
         # An alarm is that of one recording, and the sidecar counts for all.
@@ -144,6 +145,18 @@ def _names(recording: Recording) -> dict[str, list[str]]:
     if recording.commanded is not None:
         names[ACTION] = names[COMMANDED] = [f"c{i}_{recording.unit}" for i in chambers]
     return names
+
+
+def _left_out(recordings: Sequence[Recording], state: list[str]) -> list[str]:
+    """Notes on context of recordings that the values of a frame do not have."""
+    notes = []
+    for name in ("temp_C", "payload_g"):
+        known = [(r.name, getattr(r, name)) for r in recordings if name not in state]
+        some = [label for label, x in known if x is not None and np.isfinite(x).any()]
+        if some:
+            why = "has gaps" if name == "temp_C" else "is no value of a dataset"
+            notes.append(f"{name} of {', '.join(some)} {why} and is left out")
+    return notes
 
 
 def _rate(recordings: Sequence[Recording]) -> int:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from shlex import quote
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -98,7 +99,12 @@ def run(
                 spec, folder, processes, replays, about, report, cluster, warn
             )
         except KeyboardInterrupt:
-            again = f"surgisoft experiment run {typed(file)} -o {typed(folder)} --resume"
+            given = {
+                "--policy": policy, "--repeats": repeats, "--rig": rig, "--preflight": preflight,
+                "--processes": None if processes == 1 else processes, "--cluster": cluster,
+                "--no-replays": not replays, "--credibility": credibility,
+            }  # fmt: skip
+            again = f"surgisoft experiment run {typed(file)} -o {typed(folder)} --resume{_again(given)}"
             again = with_effect_files(again)
             print(f"stopped; {folder} keeps the finished blocks; continue with: {again}")
             raise typer.Exit(INTERRUPTED) from None
@@ -114,6 +120,17 @@ def run(
     if context is not None:
         print(f"credibility: {assessed.sentence}")
     show_written(files)
+
+
+def _again(given: dict[str, Any]) -> str:
+    """Options of a command to run next, by their names; those without a value are left out."""
+    text = ""
+    for name, value in given.items():
+        if value is None or value is False:
+            continue
+        values = [] if value is True else value if isinstance(value, list) else [value]
+        text += " ".join([f" {name}", *(quote(str(each)) for each in values)])
+    return text
 
 
 @commands.command("check")

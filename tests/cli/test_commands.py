@@ -1,6 +1,7 @@
 """The commands as a newcomer types them; and every wrong turn in one line."""
 
 import json
+import shlex
 import subprocess
 import sys
 from dataclasses import replace
@@ -453,8 +454,12 @@ def test_an_interrupted_experiment_says_how_to_go_on(tmp_path, monkeypatch, caps
     monkeypatch.setattr(session, "start_experiment", lambda *_, **__: started)
     monkeypatch.setattr(session, "finish_experiment", interrupted)
     assert run(["experiment", "run", "liver"]) == 130
-    said = capsys.readouterr().out
-    assert f"continue with: surgisoft experiment run liver -o {tmp_path} --resume" in said
+    plain = f"continue with: surgisoft experiment run liver -o {tmp_path} --resume"
+    assert capsys.readouterr().out.rstrip().endswith(plain)
+    given = "--policy ring runs/a --repeats 2 --rig 'laser=x endoscope=y' --preflight"
+    given += " --processes 2 --cluster tcp://a:1 --no-replays"
+    assert run(["experiment", "run", "liver", *shlex.split(given)]) == 130
+    assert capsys.readouterr().out.rstrip().endswith(f"{plain} {given}")
 
 
 def test_a_command_leaves_the_function_of_commands_in_place(capsys):

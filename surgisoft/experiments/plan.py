@@ -7,7 +7,7 @@ import itertools
 import math
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,8 @@ from surgisoft.tasks.registry import with_fields, with_present_names
 Value = int | float | str
 MOST_SETTINGS = 100_000
 """Most settings of an experiment."""
+LARGE = 1e6
+"""Absolute value from which six digits, which are enough below it, would be an exponent."""
 ROBOT_SEED = ("rig.robot_seed", "rig.specimen")
 """Names of the field that varies the robot: the present one and that of earlier versions."""
 
@@ -63,15 +65,26 @@ class Setting:
 
 
 def _short(value: Value) -> str:
-    text = Path(value).name if isinstance(value, str) else f"{value:g}"
+    """A value in characters of a file's name; a number from `LARGE` on with all of its digits."""
+    if isinstance(value, str):
+        text = Path(value).name
+    else:
+        text = f"{value:g}" if abs(value) < LARGE else f"{value:.15g}".replace("+", "")
     return "".join(c if c.isalnum() or c in "-." else "-" for c in text)
 
 
 def settings(spec: Experiment, where: Where | None = None) -> list[Setting]:
     """Every setting in order; a value that does not fit is one line."""
     place = where or Where(Path(spec.name))
+    seen: set[str] = set()
     for i, vary in enumerate(spec.vary):
         _check_vary(spec, vary, place / "vary" / i)
+        field = ROBOT_SEED[0] if vary.field in ROBOT_SEED else vary.field
+        if field in seen:
+            raise (place / "vary" / i / "field").error(
+                f"a second '{vary.field}'", "all values of a field in one [[vary]]"
+            )
+        seen.add(field)
     count = math.prod([len(spec.cases), len(spec.lesions or (None,))])
     count *= math.prod(len(vary.values) for vary in spec.vary)
     if count > MOST_SETTINGS:
@@ -119,6 +132,10 @@ def _check_vary(spec: Experiment, vary: Vary, place: Where) -> None:
             f"got '{vary.field}'",
             "task.NAME, hidden.EFFECT, rig.robot_seed, or (with faults) fault.chamber, fault.at_s",
         )
+    if top in ("hidden", "rig") and not any(case.plant == "rig" for case in spec.cases):
+        raise (place / "field").error(
+            f"got '{vary.field}', which varies on a rig only", "a case with plant = 'rig'"
+        )
 
 
 def _configured(spec: Experiment, values) -> Any:
@@ -145,6 +162,8 @@ def rig_config(setting: Setting, place: Where, arms: Sequence[str]) -> RigConfig
     hidden: dict[str, float] = {}
     for text in setting.case.hidden:
         name, colon, strength = text.partition(":")
+        if name in hidden:
+            raise (place / "cases").error(f"a second '{name}'", "each hidden effect once")
         try:
             hidden[name] = float(strength) if colon else 1.0
         except ValueError:
@@ -191,8 +210,15 @@ def scene_of(spec: Experiment, setting: Setting) -> Scene:
     return moved
 
 
-def build_task(spec: Experiment, setting: Setting) -> PhasedTask:
-    """The phased task of a setting, with its arms on the rig where the case has that plant."""
+def build_task(
+    spec: Experiment,
+    setting: Setting,
+    on_warning: Callable[[str], None] | None = warnings.warn,
+) -> PhasedTask:
+    """The phased task of a setting, with its arms on the rig where the case has that plant.
+
+    on_warning: is told of arm models that do not predict the rig, see `on_rig`.
+    """
     config = _configured(spec, setting.values)
     if setting.case.arm:
         config = with_fields(config, arm=setting.case.arm)
@@ -211,7 +237,7 @@ def build_task(spec: Experiment, setting: Setting) -> PhasedTask:
     spec = dataclasses.replace(spec, faults=faults)
     return PhasedTask(
         spec.of.experiment.supervise(
-            base if rig is None else on_rig(base, rig, on_warning=warnings.warn)
+            base if rig is None else on_rig(base, rig, on_warning=on_warning)
         ),
         spec,
     )

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -24,11 +24,18 @@ from surgisoft.agents.exact_checks import EpisodeCheck, ExactChecks, has_obstacl
 from surgisoft.agents.on_rig import at_benches, real_benches, rigs_by_arm
 from surgisoft.agents.rollout import EpisodeRecorders, Instant, Rollout, rollout
 from surgisoft.agents.run_folder import versions
-from surgisoft.config import LARGEST_INTEGER
+from surgisoft.config import LARGEST_INTEGER, Where
 from surgisoft.errors import InputError
 from surgisoft.experiments.controllers import PhaseControllers
 from surgisoft.experiments.phases import REASONS, PhasedTask, with_phase_events
-from surgisoft.experiments.plan import Setting, build_task, scene_of, settings
+from surgisoft.experiments.plan import (
+    ROBOT_SEED,
+    Setting,
+    build_task,
+    rig_config,
+    scene_of,
+    settings,
+)
 from surgisoft.experiments.spec import (
     FILE,
     Case,
@@ -38,7 +45,7 @@ from surgisoft.experiments.spec import (
 )
 from surgisoft.files import json_safe, new_folder, read_json, resolved, write_json
 from surgisoft.progress import Progress, silent
-from surgisoft.rig.registry import SIMULATED, parse_rig
+from surgisoft.rig.registry import SIMULATED, check_rig, parse_rig
 from surgisoft.surrogate.code import name_code, named_code
 from surgisoft.tasks.episodes.file import save_episode
 from surgisoft.tasks.episodes.log import EpisodeLog
@@ -105,9 +112,13 @@ def open_results(
     remote = bool(cluster or os.environ.get(CLUSTER))
     there = (folder / FILE).is_file()
     if there and resume and not force:
-        if load_experiment(folder / FILE) != spec:
+        began = load_experiment(folder / FILE)
+        names = [each.name for each in fields(spec)]
+        differ = [name for name in names if getattr(began, name) != getattr(spec, name)]
+        if differ:
             raise InputError(
-                f"{folder}: holds another experiment ({folder / FILE} differs); choose another "
+                f"{folder}: holds another experiment ({folder / FILE} differs in "
+                f"{', '.join(differ)}); run that file with --resume to continue it, choose another "
                 "folder, or --force to start again"
             )
         _check_scene(spec, folder)
@@ -149,37 +160,59 @@ def _check_scene(spec: Experiment, folder: Path) -> None:
 
 
 def check_playable(spec: Experiment) -> float:
-    """Raise an InputError unless lesions lie on the organ and controllers fit their arms.
+    """Raise an InputError unless the task and the controllers of every setting can be built.
 
-    Checked in simulation for every case: observations and actions are the same on the rig. Returns
-    the clearance below which the beam is off, mm: the larger of the file's and the scene's.
+    A case on a rig that may be real is built in simulation, where observations and actions are the
+    same; `check_benches` opens the rig. Returns the clearance below which the beam is off, mm: the
+    larger of the file's and the scene's.
     """
-    found, seen, clear_mm = settings(spec), set(), 0.0
-    if spec.in_scene:
-        for setting in {setting.lesion: setting for setting in found}.values():
-            scene_of(spec, setting)
-    for setting in found:
-        case = setting.case
-        if (case.policy, case.arm) not in seen:
-            plain = replace(case, plant="simulation", hidden=(), robot_seed=0, rigs=Case.rigs)
-            task, _ = opened(spec, replace(setting, case=plain))
-            clear_mm = task.clear_mm
-            seen.add((case.policy, case.arm))
+    found, clear_mm = settings(spec), 0.0
+    for built, setting in {_as_built(spec, setting): setting for setting in found}.items():
+        try:
+            task = build_task(spec, built, on_warning=None)  # the run warns
+            PhaseControllers(spec, task, built.case.policy)
+        except InputError as error:
+            where = f"setting '{setting.label}': " if len(found) > 1 else ""
+            raise InputError(f"{where}{error}") from None
+        clear_mm = task.clear_mm
     return clear_mm
+
+
+def _as_built(spec: Experiment, setting: Setting) -> Setting:
+    """The setting without what no task needs to be built: equal for settings that are built alike.
+
+    Raises InputError for the text of a rig that names none, or options that it does not have.
+    """
+    case = replace(setting.case, name="", robot_seed=0)
+    texts = rigs_by_arm(case.rigs, spec.of.agents).values()
+    for text in texts:
+        check_rig(text)
+    if not all(parse_rig(text).name in SIMULATED for text in texts):
+        case = Case("", policy=case.policy, arm=case.arm)
+    left_out = (*ROBOT_SEED, "fault.at_s")
+    values = tuple((field, value) for field, value in setting.values if field not in left_out)
+    if case.plant != "rig":
+        values = tuple((field, v) for field, v in values if not field.startswith("hidden."))
+    return replace(setting, number=0, case=case, values=values)
 
 
 def check_benches(spec: Experiment, folder: Path | None = None) -> None:
     """Raise an InputError unless every bench that may be real opens and fits its arm.
 
-    Each is given back at once: its episodes may begin hours later. folder: results that are
-    continued; a case whose episodes are all there needs no bench any more.
+    Each is given back at once: its episodes may begin hours later. It is opened once for every
+    choice of hidden effects, which a real rig refuses. folder: results that are continued; a case
+    whose episodes are all there needs no bench any more.
     """
     seen = set()
     for job in jobs(spec):
         case = job.setting.case
-        if case.plant != "rig" or case.name in seen or (folder and _is_done(folder, job)):
+        rig = rig_config(job.setting, Where(Path(spec.name)), spec.of.agents)
+        if rig is None or (folder and _is_done(folder, job)):
             continue
-        seen.add(case.name)
+        asked = (case.name, tuple(name for name, *_ in rig.hidden))
+        if asked in seen:
+            continue
+        seen.add(asked)
         texts = rigs_by_arm(case.rigs, spec.of.agents).values()
         if all(parse_rig(text).name in SIMULATED for text in texts):
             continue

@@ -441,9 +441,14 @@ def _check_whole(spec: Experiment, where: Where) -> None:
             f"got '{spec.limits.retreat}'", f"one of the phases: {', '.join(known)}"
         )
     for i, case in enumerate(spec.cases):
-        if case.plant != "rig" and (case.hidden or case.robot_seed or case.rigs != Case.rigs):
-            raise (where / "cases" / i).error(
-                "hidden, robot_seed or rigs in simulation", "them with plant = 'rig' only"
+        given = [
+            each
+            for each in ("hidden", "robot_seed", "rigs", "preflight")
+            if getattr(case, each) != getattr(Case, each)
+        ]
+        if case.plant != "rig" and given:
+            raise (where / "cases" / i / given[0]).error(
+                "given for a case in simulation", "it with plant = 'rig' only"
             )
 
 

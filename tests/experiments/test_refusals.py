@@ -175,6 +175,11 @@ def test_benches_are_opened_before_anything_is_written(tmp_path, monkeypatch, ca
     assert closed == ["a", "a"]
     with pytest.raises(InputError, match="cannot be opened"):
         open_results(with_rigs(spec, [missing]), tmp_path / "other")
+    varied = TINY + RIG + VARY.format(field="hidden.creep", values="0.0, 1.0")
+    with pytest.raises(InputError, match=r"OwnRig': unknown option 'hidden'"):
+        start_experiment(write(tmp_path, varied, "varied.toml"), tmp_path / "other", rigs=[own])
+    assert not (tmp_path / "other").exists()
+    closed[2:] = []
     open_results(with_rigs(spec, [missing]), tmp_path / "other", cluster="tcp://elsewhere:8786")
     for job in jobs(spec):
         for episode in range(job.first, job.first + job.count):
@@ -251,8 +256,11 @@ def test_results_go_on_only_with_their_own_scene(tmp_path):
     open_results(spec, folder, resume=True)
     with pytest.raises(InputError, match="results already exist; --resume continues them"):
         open_results(spec, folder)
-    with pytest.raises(InputError, match="holds another experiment"):
-        open_results(replace(spec, repeats=spec.repeats + 1), folder, resume=True)
+    more = replace(spec, repeats=spec.repeats + 1)
+    with pytest.raises(InputError, match=r"experiment.toml differs in repeats\); run that file"):
+        open_results(more, folder, resume=True)
+    went_on, _ = start_experiment(folder / "experiment.toml", folder, resume=True)
+    assert went_on == spec
     about = json.loads((folder / "versions.json").read_text())
     (folder / "versions.json").write_text(json.dumps(about | {"scene_hash": "0"}))
     with pytest.raises(InputError, match="has changed since the results began"):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -101,10 +102,86 @@ def test_what_varies_makes_a_grid(tmp_path):
     assert dict(found[4].values) == {"task.fire_mm": 1, "fault.chamber": 2}
 
 
+def test_large_numbers_have_labels_of_their_own(tmp_path):
+    """Six digits are enough below a million, and a file's name has no '+'."""
+    seeds = VARY.format(field="rig.robot_seed", values="1000000, 1000001, 2147483647")
+    case = '[[cases]]\nname = "a"\nplant = "rig"\n'
+    lengths = VARY.format(field="task.world.randomisation.noise_mm", values="0.1234567")
+    found = settings(load_experiment(write(tmp_path, TINY + case + seeds + lengths)))
+    assert [setting.label for setting in found] == [
+        f"a_robot_seed={seed}_noise_mm=0.123457" for seed in ("1000000", "1000001", "2147483647")
+    ]
+    one = settings(load_experiment(write(tmp_path, TINY)))[0]
+    for value, text in ((1e6, "1000000"), (2.5e20, "2.5e20"), (-1e6, "-1000000"), (1e-7, "1e-07")):
+        assert replace(one, values=(("a.b", value),)).label == f"simulation_b={text}"
+
+
+def test_a_field_varies_once_and_a_robot_on_a_rig_only(tmp_path):
+    twice = VARY.format(field="task.fire_mm", values="1, 2")
+    twice += VARY.format(field="task.fire_mm", values="3, 4")
+    case = '[[cases]]\nname = "a"\nplant = "rig"\n'
+    robots = VARY.format(field="rig.robot_seed", values="1")
+    robots += VARY.format(field="rig.specimen", values="2")
+    creep = VARY.format(field="hidden.creep", values="1.0, 2.0")
+    for text, said in (
+        (twice, "vary[1].field: a second 'task.fire_mm'; expected all values of a field in one"),
+        (case + robots, "vary[1].field: a second 'rig.specimen'; expected all values of a field"),
+        (creep, "vary[0].field: got 'hidden.creep', which varies on a rig only; expected a case"),
+        (robots, "vary[0].field: got 'rig.robot_seed', which varies on a rig only; expected a ca"),
+    ):
+        path = write(tmp_path, TINY + text)
+        with pytest.raises(InputError, match=r"tiny\.toml:\d+: " + re.escape(said)):
+            settings(load_experiment(path), read_toml(path)[1])
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            FAULT + VARY.format(field="fault.chamber", values="1, 4"),
+            "setting 'simulation_chamber=4': fault: chamber 4 of arm 'endoscope', expected 1 to 3",
+        ),
+        (
+            VARY.format(field="task.world.dt_s", values="0.1, 2.0"),
+            "setting 'simulation_dt_s=2': limits.time_s is 0.5 s, expected at least a step of 2 s",
+        ),
+        (
+            '[[cases]]\nname = "a"\npolicy = "ring"\n'
+            + VARY.format(field="task.preview", values="2, 3"),
+            "has 45 observations",
+        ),
+        (
+            '[[cases]]\nname = "a"\nplant = "rig"\n'
+            + VARY.format(field="task.world.dt_s", values="0.1, 0.07"),
+            "setting 'a_dt_s=0.07': dt_s is 0.07 s; on the rig expected a multiple of its 0.05 s",
+        ),
+        (
+            '[[cases]]\nname = "a"\nplant = "rig"\nrigs = ["virtual:sed=1"]\n',
+            "error: rig 'virtual': unknown option 'sed'",
+        ),
+    ],
+)
+def test_every_setting_is_built_before_the_first_runs(text, said, tmp_path, capsys):
+    """On the rig, too: what one of them cannot have would end the run half way."""
+    path, out = write(tmp_path, TINY + text), tmp_path / "out"
+    for command in ("check", "run"):
+        given = ["-o", str(out)] if command == "run" else []
+        assert run(["experiment", command, str(path), *given]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert said in line
+    assert not out.exists()
+
+
 def test_hidden_effects_are_for_the_rig(tmp_path):
     case = '[[cases]]\nname = "a"\nhidden = ["creep"]\n'
-    with pytest.raises(InputError, match=r"cases\[0\]: hidden, robot_seed or rigs in simulation"):
+    with pytest.raises(InputError, match=r"cases\[0\]\.hidden: given for a case in simulat"):
         load_experiment(write(tmp_path, TINY + case))
+    checked = case.replace('hidden = ["creep"]', "preflight = true")
+    with pytest.raises(InputError, match=r"cases\[0\]\.preflight: given for a case in simulation"):
+        load_experiment(write(tmp_path, TINY + checked))
+    twice = case.replace('"creep"', '"creep:0.5", "creep:2"') + 'plant = "rig"\n'
+    with pytest.raises(InputError, match="a second 'creep'; expected each hidden effect once"):
+        settings(load_experiment(write(tmp_path, TINY + twice)))
     text = TINY + case.replace('"creep"', '"grep"') + 'plant = "rig"\n'
     with pytest.raises(InputError, match="unknown hidden effect 'grep'"):
         settings(load_experiment(write(tmp_path, text)))

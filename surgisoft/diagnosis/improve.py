@@ -386,6 +386,8 @@ def improve(
             error = fall_of(problem, problem.with_model(made[-1].model)).after
             current = Round(found.verdict.kind, found.verdict.sentence, None, (), None, error)
             names = next_effects(found, added)
+            if names:
+                sealed.check(table)
             going = False
             for name in names[: most_effects - len(added)]:
                 if name in added:  # in the place of another one of the same diagnosis
@@ -449,6 +451,7 @@ def improve(
         trained = any(done.together or done.step == NETWORK for done in rounds)
         use: Use = "fitted" if trained else "amended"
         final_model.fitted_rows = FittedRows.of([table.history], use).joined(model.fitted_rows)
+    sealed.check(table)
     opened = sealed.opened(table)
     held_out = whole = opened.final_check()
     if is_paired:

@@ -70,6 +70,19 @@ def test_two_hidden_effects_are_found_added_and_judged(tmp_path, capsys):
     assert set(load_model(tmp_path / "new").effects) == {"creep", "gain_mismatch"}
 
 
+def test_a_held_out_part_without_key_points_is_refused_before_any_fit(monkeypatch, recited):
+    """The rounds would be lost at the end: nothing can validate them."""
+    made = measured_on(TRUTHS["gain_mismatch"])
+    points = made.key_points_mm.copy()
+    points[held_out_rows([made])] = np.nan
+    recording = replace(made, key_points_mm=points)
+    monkeypatch.setattr(loop, "fit_effects", lambda *_, **__: pytest.fail("fitted"))
+    for answer in (said("identified", "gain_mismatch"), said("nothing_missing")):
+        recited(answer)
+        with pytest.raises(InputError, match=r"the held-out part, .* has 0 rows with key points"):
+            improve(bare_arm(), [recording])
+
+
 def test_a_model_that_misses_nothing_is_left_alone(tmp_path, capsys):
     save_model(bare_arm(), tmp_path / "arm")
     save_recording(measured_on(bare_arm()), tmp_path / "clean.parquet")

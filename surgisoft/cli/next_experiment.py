@@ -105,6 +105,8 @@ def next_experiment(
     from surgisoft.diagnosis.design.schedules import AS_IT_STANDS, SETUPS, schedule_text
 
     competing = [name for item in between or [] for name in item.split(",") if name] or None
+    if between and competing is None:
+        raise InputError("--between names no effect; give two or more, or leave it out")
     settings = (AS_IT_STANDS,) if as_it_stands else tuple(SETUPS)
     with progress("next-experiment") as report:
         result = find_experiment(

@@ -328,6 +328,11 @@ def amend(
     begin = time.perf_counter()
     tell = progress or (lambda text: None)
     names = [named_effect(given) for given in ([effects] if isinstance(effects, str) else effects)]
+    if not names:
+        raise InputError(
+            "no effect is named to amend the model with, expected at least one, such as creep; "
+            "'surgisoft diagnose' tells which one is missing"
+        )
     refuse_predictions(model)
     given = name_of(model)
     model, recordings, before = open_model(model, recordings, before, None, error_mm)

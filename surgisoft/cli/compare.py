@@ -106,6 +106,7 @@ def compare(
     earlier = read_before(before, paired)
 
     from surgisoft.diagnosis.compare import compare_all
+    from surgisoft.diagnosis.other_models import takes_error
 
     models = [model, *others]
     with progress("compare") as tell:
@@ -164,7 +165,8 @@ def compare(
     if compared[best].result.explainable:
         names = typed(*recordings)
         since = before_options(before, paired)
-        since += model_options(predictions, model_error)
+        its_error = model_error if not others or takes_error(models[best]) else None
+        since += model_options(predictions, its_error)
         following = with_effect_files(f"surgisoft diagnose {typed(models[best])} {names}{since}")
         closest = " from the model of the smallest error" if others else ""
         print(f"next, which effect is missing{closest}: {following}")

@@ -49,7 +49,8 @@ ModelError = Annotated[
         "--model-error",
         metavar="MM",
         help="Validated RMS error of a key point, mm, of a callable model or of predictions. "
-        "Default: the error that the callable states, else its error on --before.",
+        "Of several models in `compare`, it is that of the one callable among them. Default: the "
+        "error that the callable states, else its error on --before.",
     ),
 ]
 Recordings = Annotated[

@@ -18,7 +18,7 @@ from surgisoft.diagnosis.inputs import (
     refuse_rows_of_fit,
     with_known_residuals,
 )
-from surgisoft.diagnosis.other_models import name_of, open_model
+from surgisoft.diagnosis.other_models import name_of, open_model, takes_error
 from surgisoft.diagnosis.pairs import Change, Paired, before_and_after
 from surgisoft.diagnosis.residuals import (
     LEAST_BLOCKS,
@@ -350,20 +350,33 @@ def compare_all(
     recordings: Recordings,
     names: Sequence[str] | None = None,
     progress: Progress = silent,
+    error_mm: float | None = None,
     **options,
 ) -> list[Compared]:
     """Compare several models with the same recordings; `options` are those of `compare`.
 
     names: names of the models, which default to those of their folders. progress: called with the
-    number of models that are done.
+    number of models that are done. error_mm: validated error, mm, of the one model of several that
+    is no arm model; raises InputError where more than one is none.
     """
     if names is None:
         names = [name_of(model) or f"model {i}" for i, model in enumerate(models, 1)]
+    its = models[0] if len(models) == 1 else None
+    if error_mm is not None and len(models) > 1:
+        foreign = [model for model in models if takes_error(model)]
+        if len(foreign) != 1:
+            raise InputError(
+                f"--model-error {error_mm:g} is the error of one callable, got {len(foreign)} "
+                f"among {len(models)} models; compare them one at a time, or state the error of "
+                "each callable by its attribute error_mm"
+            )
+        its = foreign[0]
     measured = load_recordings(recordings)
     results = []
     for done, (model, name) in enumerate(zip(models, names, strict=True)):
         progress(done, len(models), name)
-        results.append(compare(model, measured, **options))
+        own_mm = error_mm if model is its else None
+        results.append(compare(model, measured, error_mm=own_mm, **options))
     sizes = {table.measured_mm.shape for _, table in results}
     if len(sizes) > 1:
         listed = ", ".join(

@@ -79,6 +79,13 @@ def is_predictions_file(model: Any) -> bool:
     return isinstance(model, str | Path) and Path(model).suffix in SUFFIXES
 
 
+def takes_error(model: Any) -> bool:
+    """Whether a validated error may be given beside a model: an arm model has its own."""
+    if isinstance(model, str | Path):
+        return is_predictions_file(model) or is_callable_name(str(model))
+    return not isinstance(model, ArmModel)
+
+
 def name_of(model: Any) -> str:
     """Name of a model that was given by its folder, file or name; empty for an object."""
     return Path(model).name if isinstance(model, str | Path) else ""

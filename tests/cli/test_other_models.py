@@ -3,6 +3,7 @@
 import json
 import sys
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -72,7 +73,11 @@ BAD = {
     "compare default bench.parquet --predictions lab.csv": "takes the place of one",
     "compare default bench.parquet --model-error 0.5": "only with a callable",
     "compare my_arm.py:arm bench.parquet --model-error -1": "more than 0 mm",
+    "compare my_arm.py:arm bad.py:flat bench.parquet --model-error 1": "got 2 among 2 models",
+    "compare default default bench.parquet --model-error 1": "got 0 among 2 models",
     "amend lab.csv --effect creep --data bench.parquet -o new": "cannot be amended",
+    "amend default --effect , --data bench.parquet -o new": "no effect is named to amend the mod",
+    "next-experiment default --between , -o new.csv": "--between names no effect",
     "next-experiment lab.csv -o new.csv": "predictions are given without recordings",
     "amend my_arm.py:arm --effect creep --data bench.parquet -o new --refit always": "no network",
     "export my_arm.py:arm -o new --check": "is an arm model; --which and --check are for training",
@@ -90,6 +95,21 @@ def test_bad_input_is_one_line(command, bench, capsys):
     assert BAD[command] in error
     assert len([line for line in error.splitlines() if "error:" in line]) == 1
     assert {path.name for path in bench.iterdir()} - {"__pycache__"} == before - {"__pycache__"}
+
+
+def test_the_model_error_is_of_the_callable_among_several_models(capsys):
+    """It is one model's; a folder has its own, in the next command too."""
+    both = ["compare", "default", "my_arm.py:arm", "bench.parquet", "--model-error", "1.25"]
+    assert run([*both, "--json", "both.json"]) == 0
+    printed = capsys.readouterr().out
+    assert run([both[0], *both[2:], "--json", "one.json"]) == 0
+    alone = json.loads(Path("one.json").read_text())
+    of_default, of_callable = json.loads(Path("both.json").read_text())["models"]
+    assert {name: of_callable[name] for name in alone} == alone
+    assert of_default["rmse_mm"] < of_callable["rmse_mm"]
+    following = printed.splitlines()[-1]
+    assert "surgisoft diagnose default bench.parquet" in following
+    assert "--model-error" not in following
 
 
 def test_a_callable_and_its_predictions_give_one_comparison(capsys, tmp_path):

@@ -107,6 +107,8 @@ def diagnose(
     check_replay(replay)
     if replay and not before:
         raise InputError("--replay shows a change; add --before REC, or use 'surgisoft compare'")
+    if apply and not setup_tests:
+        raise InputError("--apply corrects what the set-up tests find: leave --no-setup-tests out")
     check_new_folder(apply)
     check_model(model, predictions)
     measured = read_recordings(recordings)

@@ -18,13 +18,17 @@ from surgisoft.cli.options import (
 )
 from surgisoft.cli.progress import progress
 from surgisoft.command_line import typed
-from surgisoft.errors import Interrupted
+from surgisoft.errors import InputError, Interrupted
 
 if TYPE_CHECKING:
     from surgisoft.surrogate.model import Validation
 
 ABOVE_NOISE = 2.0
 """Ratio of the held-out error to the noise from which `fit` advises to try effects with memory."""
+WIDTHS = "128,128,128,128"
+"""Default of --widths."""
+WITH_WIDTHS = ("haw_nn", "auto")
+"""Networks with hidden layers whose widths --widths gives."""
 
 
 @app.command()
@@ -83,7 +87,7 @@ def fit(
     ] = 1,
     widths: Annotated[
         str, typer.Option(metavar="N,N...", help="Widths of HAW-NN's hidden layers.")
-    ] = "128,128,128,128",
+    ] = WIDTHS,
     actuation: Annotated[
         Literal["measured", "commanded"],
         typer.Option(help="Which actuation is the model's input."),
@@ -108,6 +112,8 @@ def fit(
     out and reported. Ctrl-C keeps the best model so far, and its report.json says where the fit was
     interrupted; before the first validation nothing is written.
     """
+    if network not in WITH_WIDTHS and widths != WIDTHS:
+        raise InputError(f"--widths is for the network haw_nn, not {network}; leave it out")
     train = read_recordings(recordings)
     held = read_recordings(valid) if valid else None
 

@@ -221,6 +221,7 @@ def recording_(
 
     With --lerobot they are also written as a LeRobotDataset, from which LeRobot trains policies.
     """
+
     from surgisoft.measurement.recordings import summary
     from surgisoft.measurement.recordings.lerobot import TASK, save_lerobot
     from surgisoft.memory import keep_freed_memory

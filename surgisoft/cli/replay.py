@@ -23,8 +23,11 @@ def replay(
     port: Port = None,
     screenshot: Screenshot = None,
     size: Annotated[
-        str, typer.Option(metavar="WxH", help="Size of the picture's window, in points.")
-    ] = "1600x1000",
+        str | None,
+        typer.Option(
+            metavar="WxH", help="Size of the picture's window, in points; default: 1600x1000."
+        ),
+    ] = None,
     time: Annotated[
         float | None,
         typer.Option(

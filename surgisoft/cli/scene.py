@@ -214,6 +214,8 @@ def show(
     from surgisoft.scene.folder import open_scene
     from surgisoft.tasks.world.reach import reaches_of
 
+    if sum((web, screenshot is not None, save is not None)) > 1:
+        raise InputError("expected at most one of --web, --screenshot and --save")
     if port is not None and not web:
         raise InputError("--port applies to a browser only: give --web too")
     if screenshot is not None:

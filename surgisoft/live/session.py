@@ -466,6 +466,10 @@ class _Session:
         if request.scheduled:
             if request.task is not None or request.config is not None:
                 raise InputError("a schedule has no task: leave --task and --config out")
+            if not request.cameras or request.observer_gain is not None:
+                raise InputError(
+                    "a schedule observes nothing: leave --no-cameras and --observer-gain out"
+                )
             return None, None
         if request.policy not in POLICIES and not run_path(request.policy).exists():
             known = [*POLICIES, "the folder of a training run", "SCHEDULE.csv", *PROTOCOLS]

@@ -111,6 +111,8 @@ def open_replay(
         raise InputError("--time and --view apply to a picture only: give --screenshot too")
     if screenshot is not None:
         check_picture(Path(screenshot))
+    if size is not None and screenshot is None and not notebook:
+        raise InputError("--size applies to a picture only: give --screenshot too")
     if view is not None and found.suffix != SUFFIX:
         check_view(view, layout_names(load_episode(found)))
     if save is not None:

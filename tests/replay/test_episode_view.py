@@ -268,6 +268,7 @@ def test_the_command_finds_the_newest_and_says_what_is_wrong(log, replay, tmp_pa
     assert "expected WIDTHxHEIGHT" in told(replay.path, "--size", "big")
     assert "at most one" in told(replay.path, "--web", "--screenshot", tmp_path / "a.png")
     assert "give --screenshot" in told(replay.path, "--time", "3")
+    assert "give --screenshot" in told(replay.path, "--size", "800x600")
     picture = tmp_path / "a.png"
     assert "expected 0 to 4.6 s" in told(replay.path, "--screenshot", picture, "--time", "99")
     assert "replay already" in told(replay.path, "--save", tmp_path / "b.rrd")

@@ -44,6 +44,7 @@ from surgisoft.tasks.trajectories.closed_path import (
 from surgisoft.tasks.world.arm import Randomisation
 from surgisoft.tasks.world.pytree import ObjectBatch, rows, tree_map, with_rows
 from surgisoft.tasks.world.random_streams import streams
+from surgisoft.tasks.world.scene import SceneEngineConfig
 from surgisoft.tasks.world.world import WorldConfig
 
 
@@ -467,6 +468,10 @@ def test_the_script_is_the_same_for_one_and_for_many():
         (lambda: FollowConfig(path="star"), "star.*circle.*square"),
         (lambda: FollowConfig(size_mm=-1.0), "size_mm is -1.0"),
         (lambda: FollowConfig(loop_s=math.nan), "loop_s is nan"),
+        (lambda: FollowConfig(approach_s=-1.0), "approach_s is -1.0, expected 0 or more"),
+        (lambda: TrackBodyConfig(approach_s=math.nan), "approach_s is nan"),
+        (lambda: SceneEngineConfig(view_points=0), "view_points is 0, expected above 0"),
+        (lambda: SceneEngineConfig(band_mm=-1.0), "band_mm is -1.0, expected above 0"),
         (lambda: FollowConfig(history_steps=-1), "history_steps is -1"),
         (lambda: LaserPlaneConfig(distance_mm=0.0), "distance_mm is 0.0"),
         (lambda: TrackBodyConfig(slow_s=0.0), "slow_s is 0.0"),

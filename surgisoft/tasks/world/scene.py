@@ -116,8 +116,9 @@ class SceneEngineConfig:
     def __post_init__(self):
         if self.geometry not in GEOMETRIES:
             raise unknown_name("geometry", self.geometry, GEOMETRIES)
-        if not self.view_points > 0:
-            raise InputError(f"scene_engine: view_points is {self.view_points}, expected 1 or more")
+        for name in ("view_points", "depth_mm", "band_mm"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"scene_engine: {name} is {getattr(self, name)}, expected above 0")
 
 
 class SceneEngine:

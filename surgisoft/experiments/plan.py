@@ -31,6 +31,8 @@ from surgisoft.tasks.registry import with_fields, with_present_names
 Value = int | float | str
 MOST_SETTINGS = 100_000
 """Most settings of an experiment."""
+LONGEST_LABEL = 200
+"""Most bytes of a setting's label: a file's name has 255, with a number and an ending."""
 LARGE = 1e6
 """Absolute value from which six digits, which are enough below it, would be an exponent."""
 ROBOT_SEED = ("rig.robot_seed", "rig.specimen")
@@ -95,6 +97,12 @@ def settings(spec: Experiment, where: Where | None = None) -> list[Setting]:
     for setting in found:
         rig_config(setting, place, spec.of.agents)
     labels = [setting.label for setting in found]
+    longest = max(labels, key=lambda label: len(label.encode()))
+    if (size := len(longest.encode())) > LONGEST_LABEL:
+        raise (place / "vary").error(
+            f"the setting '{longest[:40]}...' has {size} bytes in its name",
+            f"at most {LONGEST_LABEL}, for the names of its files; shorten values or cases' names",
+        )
     if twice := [label for label, number in Counter(labels).items() if number > 1]:
         raise (place / "vary").error(f"'{min(twice)}' appears twice", "values that differ")
     return found

@@ -116,6 +116,22 @@ def test_large_numbers_have_labels_of_their_own(tmp_path):
         assert replace(one, values=(("a.b", value),)).label == f"simulation_b={text}"
 
 
+def test_labels_fit_into_the_names_of_files(tmp_path):
+    """A file's name has 255 bytes; the run would end where it writes its first row."""
+    lesion = f'[[lesions]]\nname = "{"l" * 64}"\ncentre_mm = [0.0, 0.0, 0.0]\n'
+    text = TINY + f'[[cases]]\nname = "{"c" * 64}"\n' + lesion
+    path = write(tmp_path, text)
+    assert len(settings(load_experiment(path))[0].label) == 129
+    text += VARY.format(field="task.world.scene_engine.geometry", values=f'"{"batched"}"')
+    text += "".join(
+        VARY.format(field=f"task.{name}", values="1.23456")
+        for name in ("cut_s", "fire_mm", "far_mm", "fine_mm", "approach_s")
+    )
+    path = write(tmp_path, text)
+    with pytest.raises(InputError, match=r"has 2\d\d bytes in its name; expected at most 200"):
+        settings(load_experiment(path))
+
+
 def test_a_field_varies_once_and_a_robot_on_a_rig_only(tmp_path):
     twice = VARY.format(field="task.fire_mm", values="1, 2")
     twice += VARY.format(field="task.fire_mm", values="3, 4")

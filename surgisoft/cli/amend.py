@@ -137,6 +137,9 @@ def amend(
         written.append(write_before_and_after(result, tables, model.name, replay))
     for name in result.refitted:
         print(f"{name}: the model had this effect already; its parameters were fitted again")
+    for name in result.effects:
+        if "#" in name:
+            print(f"{name}: one more of its kind, which leaves less than that of the model does")
     show_parameters(result.parameters, result.in_words)
     if result.retuned:
         print(

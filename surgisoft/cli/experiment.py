@@ -104,7 +104,9 @@ def run(
                 "--processes": None if processes == 1 else processes, "--cluster": cluster,
                 "--no-replays": not replays, "--credibility": credibility,
             }  # fmt: skip
-            again = f"surgisoft experiment run {typed(file)} -o {typed(folder)} --resume{_again(given)}"
+            again = (
+                f"surgisoft experiment run {typed(file)} -o {typed(folder)} --resume{_again(given)}"
+            )
             again = with_effect_files(again)
             print(f"stopped; {folder} keeps the finished blocks; continue with: {again}")
             raise typer.Exit(INTERRUPTED) from None

@@ -392,7 +392,8 @@ def amend(
     else:
         judged = None
         tell(f"fitting {' + '.join(names)}")
-        fitted = fit_effects(problem, names)
+        fitted = fit_effects(problem, names, more=names)
+        names = [fitted.key(name) for name in names]
         parameters, words, refitted = fitted.parameters, fitted.in_words, fitted.refitted
         better, retuned = fitted.model, False
         shown_by_training = fall_of(problem, problem.with_model(better), fitted.p_value).significant

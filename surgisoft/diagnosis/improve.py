@@ -361,7 +361,8 @@ def improve(
             fitted = fit_together(posed, trained_with, validated, progress=refit_progress)
             fitted = fitted.beside(made[-1].parameters, made[-1].in_words)
         else:
-            fitted = fit_effects(posed, [*added, name])
+            fitted = fit_effects(posed, [*added, name], more=[name])
+            name = fitted.key(name)
         fall = fall_of(posed, problem.with_model(fitted.model))
         doubt = _doubt(name, fall, fitted.parameters)
         if not doubt and isinstance(fitted, JointFit):

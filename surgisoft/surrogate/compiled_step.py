@@ -263,8 +263,8 @@ def _array(tensor: Tensor) -> np.ndarray:
 def _plays(effect: Hysteresis) -> list[np.ndarray]:
     """Constants of an effect's play operators: lines (m, L) and (m, m, L), and one after another
     with zeros up to whole vectors (P,) the radii, (m, P) the weights and the slopes."""
-    weight = effect.turned[effect.turns] if effect.ring else effect.weight
-    slope = torch.zeros_like(weight) if effect.ring else effect.slope
+    weight, slope = effect.weights, effect.slopes
+    slope = torch.zeros_like(weight) if slope is None else slope
     origin, more = effect.lines(effect.origin), (0, -weight[0].numel() % LANES)
     radius = nn.functional.pad(effect.radius.repeat(len(origin)), more)
     wide = [nn.functional.pad(t.flatten(1), more) for t in (weight, slope)]

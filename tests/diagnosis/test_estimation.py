@@ -46,6 +46,7 @@ from surgisoft.measurement.recordings import Recording
 from surgisoft.report import Text
 from surgisoft.surrogate.checkpoint import default_arm
 from surgisoft.surrogate.effects import make_effect
+from surgisoft.surrogate.effects.hysteresis import FEW_RADII
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import RecurrentArm
 from tests.diagnosis.synthetic import walk
@@ -606,3 +607,37 @@ def test_a_page_has_words_and_former_values_of_parameters():
     place = table.header.index("before")
     assert [row[place] for row in table.rows] == ["-", "120"]
     assert {len(row) for row in table.rows} == {len(table.header)}
+
+
+@pytest.mark.parametrize("more", [True, False])
+def test_a_second_effect_of_a_kind_is_added_where_the_present_one_fitted_anew_leaves_more(more):
+    """Loops of plays at other radii and lines beside those of the arm's own wall."""
+    arm = default_arm()
+    arm.network.requires_grad_(False)
+    form = {"radii": FEW_RADII, "ring": True, "pairs": False}
+    weights = 0.05 * torch.eye(3, len(FEW_RADII)).flip(1)
+    truth = with_truth("hysteresis", {"turned": weights}, arm, **form)
+    problem = problem_of(arm, [measured_on(truth, rows=300)])
+    fitted = fit_effects(problem, ["hysteresis"], more=["hysteresis"] if more else [])
+    left = rms(problem.with_model(fitted.model).residual)
+    if more:
+        assert fitted.keys == {"hysteresis": "hysteresis#2"}
+        assert fitted.refitted == ()
+        assert set(fitted.in_words) == {"hysteresis#2"}
+        assert left == pytest.approx(np.sqrt(3) * NOISE_MM, rel=0.1)
+    else:
+        assert (fitted.keys, fitted.refitted) == ({}, ("hysteresis",))
+        assert left > 1.4 * np.sqrt(3) * NOISE_MM
+
+
+def test_the_present_effect_is_fitted_anew_where_one_more_does_no_better():
+    arm = default_arm()
+    arm.network.requires_grad_(False)
+    truth = copy.deepcopy(arm)
+    truth.effects["hysteresis"].weight.data.mul_(1.5)
+    problem = problem_of(arm, [measured_on(truth, rows=300)])
+    fitted = fit_effects(problem, ["hysteresis"], more=["hysteresis"])
+    assert (fitted.keys, fitted.refitted) == ({}, ("hysteresis",))
+    assert list(fitted.model.effects) == ["hysteresis"]
+    left = rms(problem.with_model(fitted.model).residual)
+    assert left == pytest.approx(np.sqrt(3) * NOISE_MM, rel=0.15)

@@ -229,7 +229,7 @@ def test_an_effect_that_is_named_again_is_sought_in_another_form(recited, monkey
     drifting = with_truth("drift", {"gain": [0.05, 0.0, 0.0]}, kind="actuation")
     fit_effects = loop.fit_effects
 
-    def first_in_a_wrong_form(problem, names):
+    def first_in_a_wrong_form(problem, names, more):
         monkeypatch.setattr(loop, "fit_effects", fit_effects)
         return replace(fit_effects(problem.with_model(drifting), names), refitted=())
 

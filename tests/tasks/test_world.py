@@ -382,7 +382,7 @@ def test_a_scene_takes_arms_in_psi(tripod, tmp_path):
     [
         (lambda: WorldConfig(dt_s=0.0), "dt_s is 0.0"),
         (lambda: WorldConfig(samples=1), "samples is 1"),
-        (lambda: SceneEngineConfig(view_points=0), "view_points is 0, expected 1 or more"),
+        (lambda: SceneEngineConfig(view_points=0), "view_points is 0, expected above 0"),
         (lambda: Pneumatics(step_kPa=-1.0), "step_kPa is -1.0"),
         (lambda: Pneumatics(tau_s=math.nan), "tau_s is nan"),
         (lambda: Randomisation(noise_mm=-0.1), "noise_mm is -0.1"),

@@ -29,7 +29,7 @@ from surgisoft.diagnosis.estimation.least_squares import (
 from surgisoft.diagnosis.estimation.network_error import NetworkError
 from surgisoft.diagnosis.residuals import Problem
 from surgisoft.errors import InputError
-from surgisoft.surrogate.effects import Effect
+from surgisoft.surrogate.effects import Effect, free_name, hypothesis_of
 from surgisoft.surrogate.model import ArmModel
 
 LARGE = 24
@@ -63,6 +63,13 @@ class Fitted:
     alone; None where no effect is new, or one has so many values that a ridge holds them."""
     in_words: dict[str, str] = field(default_factory=dict)
     """What the parameters mean, by effect; empty where nothing is known."""
+    keys: dict[str, str] = field(default_factory=dict)
+    """Names in the model of effects that were added beside one of their kind: `creep#2` of
+    `creep`."""
+
+    def key(self, name: str) -> str:
+        """Name in the model of an effect that was asked for."""
+        return self.keys.get(name, name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +85,8 @@ class _Ended:
     """The last fit of each set of effects that were fitted together."""
     others: list[Fit]
     """Fits of the only effect from other starts, where it is new and of the same form."""
+    keys: dict[str, str]
+    """As `Fitted.keys`."""
 
     def free(self, keys: tuple[str, ...]) -> dict[str, nn.Parameter]:
         """What was fitted of effects that were fitted together."""
@@ -87,9 +96,13 @@ class _Ended:
         return free_parameters(self.model, keys)
 
 
-def fit_effects(problem: Problem, names: list[str]) -> Fitted:
-    """Fit the named effects in a problem's model; one that it lacks is added first."""
-    ended = _ended(problem, names)
+def fit_effects(problem: Problem, names: list[str], more: Sequence[str] = ()) -> Fitted:
+    """Fit the named effects in a problem's model; one that it lacks is added first.
+
+    more: names among them of effects that the model may have. One that it has and of which it can
+    have several is not fitted again where one more of its kind leaves less.
+    """
+    ended = _ended(problem, names, more=more)
     model, large, refitted = ended.model, ended.large, ended.refitted
     parameters, chance, network = [], None, NetworkError.of(problem)
     words: dict[str, str] = {}
@@ -105,7 +118,8 @@ def fit_effects(problem: Problem, names: list[str]) -> Fitted:
     order = {name: position for position, name in enumerate(ended.names)}
     parameters.sort(key=lambda parameter: order[parameter.effect])
     words = {name: words[name] for name in ended.names}
-    return Fitted(model.eval().requires_grad_(False), tuple(parameters), refitted, chance, words)
+    model = model.eval().requires_grad_(False)
+    return Fitted(model, tuple(parameters), refitted, chance, words, ended.keys)
 
 
 def fitted_model(problem: Problem, names: list[str]) -> ArmModel:
@@ -116,7 +130,9 @@ def fitted_model(problem: Problem, names: list[str]) -> ArmModel:
     return ended.model.eval().requires_grad_(False)
 
 
-def _ended(problem: Problem, names: list[str], slopes_at_end: bool = True) -> _Ended:
+def _ended(
+    problem: Problem, names: list[str], slopes_at_end: bool = True, more: Sequence[str] = ()
+) -> _Ended:
     """The fits of `fit_effects`; slopes_at_end: as of `fit_all`."""
     model = copy.deepcopy(problem.model)
     if not model.takes_effects:
@@ -124,14 +140,22 @@ def _ended(problem: Problem, names: list[str], slopes_at_end: bool = True) -> _E
             "effects are for models with a static network; the recurrent baseline takes none"
         )
     names = list(dict.fromkeys(names))
-    refitted = tuple(name for name in names if name in model.effects)
+    had = [name for name in names if name in model.effects]
     others: list[Fit] = []
+    keys: dict[str, str] = {}
     for position, name in enumerate(names):
         if name not in model.effects:
             beside = [each for each in names[:position] if not is_large(model.effects[each])]
-            model, *more = _added(problem.with_model(model), name, beside)
-            if len(names) == 1 and more:
-                model, others = _best_end(problem, name, [model, *more], slopes_at_end)
+            model, *rest = _added(problem.with_model(model), name, beside)
+            if len(names) == 1 and rest:
+                model, others = _best_end(problem, name, [model, *rest], slopes_at_end)
+        elif name in more:
+            further = _one_more(problem.with_model(model), name)
+            if further is not None:
+                keys[name] = free_name(name, model.effects)
+                model = further
+    refitted = tuple(name for name in had if name not in keys)
+    names = [keys.get(name, name) for name in names]
     large = [name for name in names if is_large(model.effects[name])]
     small = [name for name in names if name not in large]
     fits: dict[tuple[str, ...], Fit] = {}
@@ -140,7 +164,33 @@ def _ended(problem: Problem, names: list[str], slopes_at_end: bool = True) -> _E
             fits[name,] = fit_amplitudes(model, problem, name)
         if small:
             fits[tuple(small)] = fit_all(model, problem, small, slopes_at_end=slopes_at_end)
-    return _Ended(model, names, refitted, large, fits, others)
+    return _Ended(model, names, refitted, large, fits, others, keys)
+
+
+def _one_more(problem: Problem, name: str) -> ArmModel | None:
+    """The problem's model with one more effect of a kind that it has, roughly fitted; None where
+    that leaves no less than the present one, fitted anew, or where there can be one only."""
+    if hypothesis_of(problem.model.effects[name]).grid_further is None:
+        return None
+    anew = copy.deepcopy(problem.model)
+    present = _rough(anew, problem, [name])
+    best = _added(problem, name)[0]
+    effect = best.effects[free_name(name, problem.model.effects)]
+    left = _rough(best, problem, [free_name(name, problem.model.effects)])
+    return best if left * _price(effect) < present else None
+
+
+def _rough(model: ArmModel, problem: Problem, names: list[str]) -> float:
+    """Misfit after the first steps of a fit of effects of a model, the last of which decides."""
+    if is_large(model.effects[names[-1]]):
+        return fit_amplitudes(model, problem, names[-1]).misfit
+    return fit_all(model, problem, names, FIRST_ITERATIONS, slopes_at_end=False).misfit
+
+
+def _price(effect: Effect) -> float:
+    """What a misfit is multiplied by for the amplitudes of an effect."""
+    values = sum(p.numel() for p in effect.amplitudes().values())
+    return float((1.0 + SEARCH.amplitude_price) ** values)
 
 
 def _best_end(
@@ -239,18 +289,12 @@ def _added(problem: Problem, name: str, beside: Sequence[str] = ()) -> list[ArmM
     beside: effects of the model that are fitted with it. Fitted alone before, they have taken over
     some of what the new one does, and a form of it that does something else would then seem best.
     """
-    tried = []
+    key, tried = free_name(name, problem.model.effects), []
     for model in starts(problem, name, STARTS, every_form=True):
-        effect = model.effects[name]
-        if is_large(effect):
-            misfit = fit_amplitudes(model, problem, name).misfit
-        else:
-            fit = fit_all(model, problem, [*beside, name], FIRST_ITERATIONS, slopes_at_end=False)
-            misfit = fit.misfit
-        values = sum(p.numel() for p in effect.amplitudes().values())
-        tried.append((misfit * (1.0 + SEARCH.amplitude_price) ** values, model))
+        misfit = _rough(model, problem, [*beside, key])
+        tried.append((misfit * _price(model.effects[key]), model))
     models = [model for _, model in sorted(tried, key=lambda one: one[0])]
-    return models[:1] if is_large(models[0].effects[name]) else models
+    return models[:1] if is_large(models[0].effects[key]) else models
 
 
 def starts(
@@ -258,12 +302,14 @@ def starts(
 ) -> list[ArmModel]:
     """Models with the named effect in its best few candidates, amplitudes fitted; parts are copies.
 
+    Where the model has one, it is one more of its kind (`free_name`).
+
     The candidates are ranked by the error that each leaves on held-out blocks beside the model
     discrepancy; of two that leave nearly the same, the simpler one comes first.
 
     every_form: whether the best candidate of each other form (`Effect.config`) is a start, too.
     """
-    tried = model_candidates(problem, [name])
+    tried = [each for each in model_candidates(problem, [name]) if not each.more]
     if not tried:
         raise InputError(
             f"effect '{name}' changes nothing on these recordings, so nothing of it can be fitted; "

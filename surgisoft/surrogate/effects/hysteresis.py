@@ -12,7 +12,9 @@ whose mixture a, b is fitted with the rest. Superposed (Kuhnen 2003, eq. 8) they
 
     x_eff = x + sum_l sum_k (w_lk + v_lk (u_l - u_l(rest))) (y_lk - u_l),
 
-where v lets a loop's width depend on where it lies. With w = v = 0 nothing changes.
+where v lets a loop's width depend on where it lies. Backlash of a valve, a tendon or a joint of one
+chamber is a sum of plays of the chamber's own actuation, x_eff_i = x_i + sum_k w_ik (y_ik - x_i).
+With w = v = 0 nothing changes.
 """
 
 import torch
@@ -56,6 +58,7 @@ class Hysteresis(Effect):
         pairs: bool = True,
         others: float = 0.0,
         section: bool = False,
+        chamber: int | None = None,
     ):
         """Radii of the play operators, in units of half a line's range.
 
@@ -63,11 +66,15 @@ class Hysteresis(Effect):
         are those of all; pairs: lines along pairs of neighbours beside those along one chamber;
         others: share of the other chambers in each line to start from, negative where a chamber
         that bends the arm shortens the wall on the other side; section: the lines, those along
-        pairs too, are those of a plane section (`fibre_matrix`), others being that of a neighbour.
+        pairs too, are those of a plane section (`fibre_matrix`), others being that of a neighbour;
+        chamber: the number of the only chamber that has plays, of its own actuation; the other
+        choices do not matter then.
         """
         super().__init__(facts)
         chambers = len(facts.low)
-        self.radii, self.ring, self.pairs = tuple(radii), bool(ring), bool(pairs)
+        self.radii, self.chamber = tuple(radii), chamber
+        several = chamber is None
+        self.ring, self.pairs = bool(ring) and several, bool(pairs) and several
         centre, half = centre_and_half(facts.low, facts.high)
         self.register_buffer("centre", centre)
         self.register_buffer("half_range", half)
@@ -77,7 +84,8 @@ class Hysteresis(Effect):
         lines = first_lines(chambers)
         if not self.pairs:
             lines = lines[:chambers]
-        self.others, self.section = float(others), bool(section)
+        self.others = float(others) if several else 0.0
+        self.section = bool(section) and several
         if self.section:
             lines = fibre_matrix(torch.tensor(self.others), chambers, ring=True)
             lines = torch.cat([lines[::2], lines[1::2].roll(1, dims=0)])
@@ -87,7 +95,9 @@ class Hysteresis(Effect):
             lines = lines / lines.abs().sum(1, keepdim=True)
         self.linear = nn.Parameter(lines)
         self.bent = nn.Parameter(lines.new_zeros(len(lines), chambers, chambers))
-        if self.ring:
+        if chamber is not None:
+            self.own = nn.Parameter(torch.zeros(len(self.radii)))
+        elif self.ring:
             self.turned = nn.Parameter(torch.zeros(len(lines), len(self.radii)))
             self.register_buffer("turns", turns(chambers, len(lines)), persistent=False)
         else:
@@ -96,7 +106,10 @@ class Hysteresis(Effect):
             self.slope = nn.Parameter(torch.zeros(shape))
 
     def amplitudes(self) -> dict[str, nn.Parameter]:
-        """`weight` and `slope` (m, L, J); `turned` (L, J) for alike chambers in a ring."""
+        """`weight` and `slope` (m, L, J); of alike chambers in a ring `turned` (L, J); of one
+        chamber `own` (J,)."""
+        if self.chamber is not None:
+            return {"own": self.own}
         if self.ring:
             return {"turned": self.turned}
         return {"weight": self.weight, "slope": self.slope}
@@ -112,8 +125,23 @@ class Hysteresis(Effect):
         return x @ self.linear.T + products @ self.bent.flatten(1).T
 
     def memory_parameters(self) -> list[nn.Parameter]:
-        """The lines' mixtures a (L, m) and b (L, m, m)."""
-        return [self.linear, self.bent]
+        """The lines' mixtures a (L, m) and b (L, m, m); none of one chamber."""
+        return [self.linear, self.bent] if self.chamber is None else []
+
+    @property
+    def weights(self) -> Tensor:
+        """(m, L, J) weight w of each play operator in each chamber."""
+        if self.chamber is not None:
+            chambers = len(self.use)
+            there = torch.zeros(chambers, chambers, 1, dtype=self.own.dtype, device=self.own.device)
+            there[self.chamber, self.chamber] = 1.0
+            return there * self.own
+        return self.turned[self.turns] if self.ring else self.weight
+
+    @property
+    def slopes(self) -> Tensor | None:
+        """(m, L, J) their change v with the line's input; None where the form has none."""
+        return None if self.ring or self.chamber is not None else self.slope
 
     def rest(self, signal: Tensor) -> Tensor:
         """(B, L, J) play operators centred on the lines at the actuation (B, m): no history."""
@@ -143,12 +171,11 @@ class Hysteresis(Effect):
         return self._superpose(signal, self.lines(signal), memory)
 
     def _superpose(self, signal: Tensor, u: Tensor, memory: Tensor) -> Tensor:
-        lag = memory - u.unsqueeze(-1)
-        weight = self.turned[self.turns] if self.ring else self.weight
-        shift = lag.flatten(-2) @ weight.flatten(1).T
-        if not self.ring:
+        lag, slopes = memory - u.unsqueeze(-1), self.slopes
+        shift = lag.flatten(-2) @ self.weights.flatten(1).T
+        if slopes is not None:
             away = (u - self.lines(self.origin)).unsqueeze(-1)
-            shift = shift + (lag * away).flatten(-2) @ self.slope.flatten(1).T
+            shift = shift + (lag * away).flatten(-2) @ slopes.flatten(1).T
         return signal + self.half_range * shift
 
     def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
@@ -156,6 +183,10 @@ class Hysteresis(Effect):
         with torch.no_grad():
             u = self.lines(signal)
             lag = memory - u.unsqueeze(-1)
+            if self.chamber is not None:
+                each = lag[..., self.chamber, :, None] * self.half_range
+                mine = torch.arange(len(self.use), device=lag.device) == self.chamber
+                return torch.where(mine, each, 0.0).movedim(-2, 0)
             if self.ring:
                 # (m, L) the line that is to each chamber what line l is to the first.
                 seen = lag[..., self.turns.argsort(1), :] * self.half_range[:, None, None]
@@ -173,11 +204,12 @@ class Hysteresis(Effect):
             "pairs": self.pairs,
             "others": self.others,
             "section": self.section,
+            "chamber": self.chamber,
         }
 
     def quantities(self) -> list[Quantity]:
         """Half loop widths in the arm's unit, the lines' shares and the radii."""
-        weight = (self.turned[self.turns] if self.ring else self.weight).detach()
+        weight = self.weights.detach()
         # A full sweep opens each play by its radius on both sides.
         opened = (weight * self.radius).sum(-1) * self.half_range[:, None]
         unit = self.facts.unit
@@ -190,7 +222,8 @@ class Hysteresis(Effect):
         ]
 
     def readings(self, seconds: float | None = None) -> list[Reading]:
-        """Width of the loop of one chamber over its whole range, in the arm's unit."""
+        """Width of the loop of a chamber over its whole range, in the arm's unit: the mean of all
+        that have one."""
         unit, full = self.facts.unit, torch.diag(self.facts.high - self.facts.low)
         low, middle = self.facts.low.expand(full.shape), self.facts.low + 0.5 * full
         high = self.facts.low + full
@@ -200,6 +233,9 @@ class Hysteresis(Effect):
             rising = self.advance(memory, middle, context)
             falling = self.advance(self.advance(rising, high, context), middle, context)
             wide = self.apply(middle, falling) - self.apply(middle, rising)
+        if self.chamber is not None:
+            text = f"loop of {{}} between loading and unloading of chamber {self.chamber + 1}"
+            return [Reading(f"{text}, at half load", float(wide[self.chamber, self.chamber]), unit)]
         text = "loop of {} between loading and unloading, at half load of one chamber"
         return [Reading(text, float(wide.diagonal().mean()), unit)]
 
@@ -232,13 +268,24 @@ def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
 
 
 def _further(facts: ArmFacts, points: Tensor) -> list[Effect]:
-    """Lines along single chambers, or of a plane section: loops add up (Kuhnen 2003)."""
+    """Lines along single chambers, or of a plane section: loops add up (Kuhnen 2003).
+
+    Where the chambers are no ring of three or four, such as those of two sections, one alone may
+    have loops.
+    """
     m = len(facts.low)
     if m in RINGS:
         section = Hysteresis(facts, FEW_RADII, True, True, SECTION[m], True)
         return [*(Hysteresis(facts, FEW_RADII, True, False, o) for o in OTHERS[::2]), section]
-    some = OTHERS if m > 1 else OTHERS[:1]
-    return [Hysteresis(facts, FEW_RADII, True, False, others) for others in some]
+    if m == 1:
+        return [Hysteresis(facts, FEW_RADII, True, False)]
+    alike = [Hysteresis(facts, FEW_RADII, True, False, others) for others in OTHERS]
+    return [*alike, *(Hysteresis(facts, FEW_RADII, chamber=chamber) for chamber in range(m))]
 
 
-HYPOTHESIS = Hypothesis(Hysteresis, _grid, _further, needs_reversals=True, memory="path")
+def _together(some: list[Effect]) -> list[list[int]]:
+    """All forms of alike chambers side by side; loops of one chamber stand alone."""
+    return [[i for i, each in enumerate(some) if getattr(each, "chamber", None) is None]]
+
+
+HYPOTHESIS = Hypothesis(Hysteresis, _grid, _further, _together, needs_reversals=True, memory="path")

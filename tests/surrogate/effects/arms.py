@@ -81,4 +81,6 @@ def variants() -> dict[str, Effect]:
             kinds[effect.stage, *(tuple(p.shape) for p in effect.parameters())] = number
         for number in {len(made) // 2, *kinds.values()}:
             answer[f"{name}-{number}"] = made[number]
+    # A candidate of arms with five chambers and more.
+    answer["hysteresis-chamber"] = make_effect("hysteresis", FACTS, radii=(0.05, 0.3), chamber=1)
     return answer

@@ -6,6 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from surgisoft.surrogate.effects import ArmFacts, Context, make_effect
+from surgisoft.surrogate.effects.hysteresis import HYPOTHESIS
+from surgisoft.surrogate.effects.readings import in_words
 from tests.surrogate.effects.arms import REST_MM, stir
 
 LOW, HIGH = torch.tensor([-10.0, -10.0, -10.0]), torch.tensor([50.0, 50.0, 50.0])
@@ -93,3 +95,30 @@ def test_lines_of_a_plane_section_stand_along_and_between_chambers():
     lines = make_effect("hysteresis", FACTS, others=-0.2, section=True).linear
     assert torch.allclose(lines[0], torch.tensor([1.0, -0.2, -0.2]) / 1.4, atol=1e-6)
     assert torch.allclose(lines[4], torch.tensor([1.0, 1.0, -1.0]) / 3, atol=1e-6)
+
+
+def test_backlash_of_one_chamber_by_hand():
+    """The middle chamber follows through a gap of 2 x 6 kPa, its neighbours at once."""
+    effect = make_effect("hysteresis", FACTS, radii=(0.2, 0.5), chamber=1)
+    with torch.no_grad():
+        effect.own[0] = 1.0
+    steps = [(10.0, 20.0, 5.0), (12.0, 30.0, 5.0), (14.0, 27.0, 5.0), (9.0, 10.0, 5.0)]
+    x = torch.tensor([steps])
+    found = effect.apply(x, effect.scan(effect.rest(x[:, 0]), x, still(len(steps))))[0]
+    assert torch.allclose(found[:, [0, 2]], x[0][:, [0, 2]], atol=1e-5)
+    said = in_words(effect.readings())
+    assert said == "loop of 12 kPa between loading and unloading of chamber 2, at half load"
+    assert torch.allclose(found[:, 1], torch.tensor([20.0, 24.0, 24.0, 16.0]), atol=1e-4)
+
+
+@pytest.mark.parametrize("chambers", [1, 2, 3, 4, 6])
+def test_each_chamber_is_tried_alone_where_they_stand_in_no_ring(chambers):
+    """Two sections of three chambers are no ring of six: one chamber may have all of the play."""
+    ones = torch.ones(chambers)
+    arm = ArmFacts(-10.0 * ones, 50.0 * ones, 0.0 * ones, REST_MM)
+    for tried in (HYPOTHESIS.candidates, HYPOTHESIS.further):
+        made = tried(arm, REST_MM[None])
+        alone = [i for i, effect in enumerate(made) if effect.chamber is not None]
+        assert [made[i].chamber for i in alone] == list(range(chambers * (chambers in (2, 6))))
+        (together,) = HYPOTHESIS.combinations(made)
+        assert sorted(together + alone) == list(range(len(made)))

@@ -27,8 +27,10 @@ MOST_MISSING = 0.2
 
 
 def _far_from_fit(problem: Problem) -> float:
-    """Share of the rows whose actuation is far from all that the model was fitted on."""
-    known = problem.reference
+    """Share of the rows whose actuation is far from all that the model was fitted on: the rows that
+    it keeps of its fit, or where it keeps none those of the reference."""
+    fit = problem.model.training_residuals
+    known = problem.reference if fit is None else problem.with_reference(fit).reference
     if known is None or len(known.pressure) < 2:
         return 0.0
     return far_share(known.pressure, problem.pressure)

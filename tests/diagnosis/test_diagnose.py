@@ -218,6 +218,8 @@ def test_what_is_weak_about_the_data_is_told(found):
     assert data_quality_warnings(problem) == []
     away = replace(problem, pressure=np.full_like(problem.pressure, 3.0))
     assert "far from those" in data_quality_warnings(away)[0]
+    twice = problem.with_reference([recording, recording])  # the same actuation, distance 0
+    assert data_quality_warnings(twice) == []
     loud = replace(problem.table, noise_mm=problem.noise_mm + 9.0, floor=Floor(9.0, "holds"))
     shaken = replace(problem, table=loud)
     assert "shakes the arm" in data_quality_warnings(shaken)[0]

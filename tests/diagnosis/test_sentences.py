@@ -419,7 +419,8 @@ def test_warnings_about_recordings_are_a_sentence_each():
             "table": table(), "floor_mm": 0.1,
             "motion": np.arange(8), "measured": np.zeros((10, 2, 3)),
             "model": SimpleNamespace(
-                validation=SimpleNamespace(rmse_mm=0.05), spec=SimpleNamespace(actuation="measured")
+                validation=SimpleNamespace(rmse_mm=0.05),
+                spec=SimpleNamespace(actuation="measured"), training_residuals=None,
             ), "reference": None,
         }  # fmt: skip
         return SimpleNamespace(**(values | fields))

@@ -17,12 +17,16 @@ from surgisoft.measurement.recordings import Recording, check_same_arm, load_rec
 from surgisoft.surrogate.effects import named_effect
 from surgisoft.surrogate.fit import AUTO, FitConfig, FitResult
 from surgisoft.surrogate.fit import fit as fit_histories
-from surgisoft.surrogate.fitted_rows import FittedRows
+from surgisoft.surrogate.fitted_rows import FittedRows, row_hashes
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.workers import torch_threads
 
 Recordings = Iterable[Recording | str | Path] | Recording | str | Path
 """Recordings, their files, or folders of them."""
+SAME_ROWS = 0.1
+"""Least share of the rows of the shorter of two recordings that both have, from which on they are
+the same measurement under two names. A row at rest before coarse sensors, which many recordings
+share, is less than that."""
 
 
 def fit(
@@ -39,7 +43,7 @@ def fit(
 
     The model (Chen et al. 2025) maps actuation (T, m), in the recordings' unit, to key points
     (T, n, 3) mm in the arm base frame. Raises InputError where the recordings are of different
-    arms, too short, or hold numbers that are not finite. Ctrl-C raises `Interrupted`
+    arms, too short, have rows in common, or hold numbers that are not finite. Ctrl-C raises `Interrupted`
     (`surgisoft.errors`), whose `result` has the best model so far, or KeyboardInterrupt before the
     first validation.
 
@@ -62,6 +66,7 @@ def fit(
     held = None if valid is None else load_recordings(valid)
     check_same_arm(train)
     spec = arm_spec(train, actuation)
+    _refuse_repeated_rows(train, actuation)
     if held:
         check_fits(spec, held)
         _refuse_training_rows(train, held, actuation)
@@ -100,6 +105,26 @@ def jump_level(model: ArmModel, recordings: list[Recording]) -> float:
         noise_mm=np.full(spec.key_points, math.sqrt(3.0) * noise),
     )
     return own_level_mm(motion)
+
+
+def _refuse_repeated_rows(train: list[Recording], actuation: str) -> None:
+    """Raise InputError where two training recordings are the same measurement.
+
+    Rows that are held out would be among the rows of the training, too.
+    """
+    rows = [np.unique(row_hashes(history_of([recording], actuation))) for recording in train]
+    values, counts = np.unique(np.concatenate(rows), return_counts=True)
+    repeated = values[counts > 1]
+    for later, found in enumerate(rows):
+        own = np.intersect1d(found, repeated, assume_unique=True)
+        for earlier in range(later if len(own) else 0):
+            common = len(np.intersect1d(own, rows[earlier], assume_unique=True))
+            if common >= max(1, SAME_ROWS * min(len(found), len(rows[earlier]))):
+                raise InputError(
+                    f"{train[later].label}: {100 * common / len(found):.0f} % of its rows are in "
+                    f"{train[earlier].label}, expected recordings without common rows, because "
+                    "rows that are held out must take no part in the training; give one of the two"
+                )
 
 
 def _refuse_training_rows(train: list[Recording], held: list[Recording], actuation: str) -> None:

@@ -8,6 +8,7 @@ import pytest
 from surgisoft.diagnosis.amend import amend
 from surgisoft.diagnosis.inputs import open_inputs
 from surgisoft.diagnosis.residuals import held_out_rows
+from surgisoft.errors import InputError
 from surgisoft.measurement.fitting import fit
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import make_protocol
@@ -141,3 +142,22 @@ def test_the_default_arm_knows_its_rows(pair):
     assert known.complete
     assert (known.count, len(known.hashes)) == (14_824, SIZE)
     assert known.share_of(history_of([pair[0]])) == 0.0
+
+
+def test_a_recording_under_two_names_is_not_fitted_twice(pair):
+    """Rows that are held out of the one would be fitted in the other."""
+    first, other = pair
+    cut = {
+        name: getattr(first, name)[300:600]
+        for name in ("t_s", "measured", "commanded", "key_points_mm", "run", "temp_C")
+    }
+    part = replace(first, name="cut", **cut)
+    moved = replace(first, name="moved", key_points_mm=first.key_points_mm + 0.01)
+    quick = {"effects": [], "hidden": (8,), "epochs": 1, "prior": "none"}
+    for given, share in (([first, other, replace(first, name="copy")], 100), ([first, part], 100)):
+        message = rf"^{given[-1].label}: {share} % of its rows are in {first.label}, expected"
+        with pytest.raises(InputError, match=message):
+            fit(given, **quick)
+    with pytest.raises(InputError, match=rf"^{first.label}: 20 % of its rows are in recording .cut."):
+        fit([part, first], **quick)
+    assert fit([first, other, moved], **quick).model.fitted_rows.count == 4500

@@ -127,13 +127,22 @@ def claim_folder(folder: str | Path, force: bool = False) -> Path:
         raise InputError(f"{folder}: cannot be written, {above} is not a writable folder")
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: is a file, expected a folder; choose another name")
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / "config.json").is_file():
+    if folder.is_dir() and any(folder.iterdir()) and not _holds_model(folder):
         raise InputError(f"{folder}: holds files that are not a model; choose another name")
     if folder.is_dir() and any(folder.iterdir()) and not force:
         raise InputError(
             f"{folder}: already exists; choose another name or pass --force (in Python force=True)"
         )
     return folder
+
+
+def _holds_model(folder: Path) -> bool:
+    """Whether the `config.json` of a folder is that of an arm model, of any version."""
+    try:
+        config = read_json(folder / "config.json", LARGEST_CONFIG)
+    except (InputError, OSError):
+        return False
+    return isinstance(config, dict) and {"arm", "network"} <= config.keys()
 
 
 def save_model(

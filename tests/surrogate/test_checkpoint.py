@@ -65,20 +65,41 @@ def test_a_shape_at_rest_of_other_key_points_is_refused(tmp_path):
         load_model(tmp_path / "arm")
 
 
+def training_run(folder: Path) -> None:
+    """A folder as of `surgisoft train`: a configuration, weights and a report of another kind."""
+    folder.mkdir()
+    (folder / "config.json").write_text('{"task": "reach", "seed": 0}')
+    (folder / "weights.safetensors").write_bytes(b"a week of training")
+    (folder / "report.json").write_text("{}")
+
+
+def damaged(folder: Path) -> None:
+    folder.mkdir()
+    (folder / "config.json").write_text("{")
+
+
+def files(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
 @pytest.mark.parametrize("force", [False, True])
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (Path.touch, "is a file, expected a folder; choose another name"),
         (Path.mkdir, "holds files that are not a model; choose another name"),
+        (training_run, "holds files that are not a model; choose another name"),
+        (damaged, "holds files that are not a model; choose another name"),
     ],
 )
 def test_force_is_recommended_only_where_it_helps(make, message, force, tmp_path):
     make(tmp_path / "a")
     if (tmp_path / "a").is_dir():
         (tmp_path / "a" / "letter.txt").touch()
+    before = files(tmp_path)
     with pytest.raises(InputError, match=f"{re.escape(str(tmp_path / 'a'))}: {message}$"):
-        claim_folder(tmp_path / "a", force)
+        save_model(default_arm(), tmp_path / "a", force=force)
+    assert files(tmp_path) == before
 
 
 def test_a_link_into_a_place_that_cannot_be_made_is_told_at_once(tmp_path):

@@ -280,6 +280,31 @@ def test_another_file_or_another_arm_is_refused(module):
             load_model("saved", model_code=[name])
 
 
+def tip_mm(name: str) -> list[float]:
+    """The tip at 4 and 5 of the arm of a name, mm."""
+    model = load_model(name)
+    return model.step(model.initial_state(1), torch.tensor([[4.0, 5.0]]), 0.1)[1][0, 1].tolist()
+
+
+def test_a_file_is_read_again_after_it_was_edited(module, monkeypatch):
+    """As in a notebook: the name stays, and the content changes, or the folder."""
+    first = load_model("lab_arm.py:arm")
+    assert tip_mm("lab_arm.py:arm") == [4.0, 5.0, 30.0]
+    same = first.network.named.model
+    assert load_model("lab_arm.py:arm").network.named.model is same, "nothing has changed"
+    (module / "lab_arm.py").write_text(ARM.replace("30.0", "36.0"))
+    assert tip_mm("lab_arm.py:arm") == [4.0, 5.0, 36.0]
+    save_model(first, "saved")
+    with pytest.raises(InputError, match="not the file that the model was made with"):
+        load_model("saved", model_code=["lab_arm.py:arm"])
+    (module / "other").mkdir()
+    monkeypatch.chdir(module / "other")
+    with pytest.raises(InputError, match="no such file"):
+        load_model("lab_arm.py:arm")
+    (module / "other" / "lab_arm.py").write_text(ARM.replace("30.0", "42.0"))
+    assert tip_mm("lab_arm.py:arm") == [4.0, 5.0, 42.0]
+
+
 @pytest.mark.parametrize(
     ("name", "said"),
     [

@@ -41,6 +41,8 @@ class Named:
     """Hash of the file's bytes, for `FILE.py:object`."""
     found: bool = True
     """Whether the name leads to the object, so that a saved model can be opened again."""
+    file: Path | None = None
+    """The file itself, for `FILE.py:object`: another folder may hold another of that name."""
 
 
 NAMED: dict[str, Named] = {}
@@ -75,27 +77,30 @@ def no_graph(name: str) -> InputError:
 def named_callable(name: str) -> Named:
     """Import the callable of a name, which runs its code, and remember it as named by the user.
 
-    Raises InputError where it cannot be imported, is not there or is no callable.
+    A file is run again if its content has changed since. Raises InputError where the callable
+    cannot be imported, is not there or is no callable.
     """
-    if name in NAMED:
-        return NAMED[name]
     head, colon, attribute = name.rpartition(":")
-    sha256 = None
+    known, sha256, file = NAMED.get(name), None, None
+    if known is not None and known.file is None:
+        return known
     if not colon:
         entry = offered().get(name)
         if entry is None:
-            known = ", ".join(sorted(offered())) or "none"
+            every = ", ".join(sorted(offered())) or "none"
             raise InputError(
                 f"{name}: no callable model of that name; expected package.module:object, "
-                f"FILE.py:object or an entry point of the group {GROUP} (known: {known})"
+                f"FILE.py:object or an entry point of the group {GROUP} (known: {every})"
             )
         value = _guarded(name, entry.load)
     elif head.endswith(".py"):
         path = Path(head)
         if not path.is_file():
             raise InputError(f"{head}: no such file; name a .py file and an object: FILE.py:object")
-        content = path.read_bytes()
+        content, file = path.read_bytes(), resolved(path)
         sha256 = hashlib.sha256(content).hexdigest()
+        if known is not None and (known.file, known.sha256) == (file, sha256):
+            return known
         value = _attribute(name, _guarded(name, lambda: _run_file(path, content)), attribute)
     else:
         here = str(Path.cwd())
@@ -106,7 +111,7 @@ def named_callable(name: str) -> Named:
         kind = value
         value = _guarded(name, lambda: kind())
     _check(name, value)
-    NAMED[name] = Named(name, value, sha256)
+    NAMED[name] = Named(name, value, sha256, file=file)
     return NAMED[name]
 
 

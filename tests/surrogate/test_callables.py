@@ -334,6 +334,72 @@ def test_what_a_callable_does_wrong_is_one_line(module, name, said):
         arm_around(named_callable(f"lab_arm:{name}"), spec)
 
 
+class OneBuffer:
+    """A callable that writes every answer of a method into the same array."""
+
+    def __init__(self, model):
+        self.model, self.low, self.high = model, model.low, model.high
+        self.static = getattr(model, "static", False)
+        self.kept = {}
+
+    def _in_place(self, name, answer):
+        buffer = self.kept.setdefault(name, np.zeros((1000, *answer.shape[1:])))
+        buffer[: len(answer)] = answer
+        return buffer[: len(answer)]
+
+    def __call__(self, time_s, actuation):
+        return self._in_place("call", self.model(time_s, actuation))
+
+
+class OneBufferSteps(OneBuffer):
+    def initial_state(self, actuation):
+        return self._in_place("state", self.model.initial_state(actuation))
+
+    def step(self, state, actuation, dt_s):
+        fresh, points = self.model.step(state, actuation, dt_s)
+        return self._in_place("state", fresh), self._in_place("points", points)
+
+
+@pytest.mark.parametrize(
+    ("plain", "kind"), [(WholeRuns(), OneBuffer), (Steps(), OneBufferSteps)], ids=["runs", "steps"]
+)
+def test_a_callable_may_use_its_arrays_again(plain, kind):
+    """Two runs, and then the first ones again: no answer changes one that was given before."""
+    model, one = around(kind(plain)), around(plain)
+    expected = one.predict(runs())
+    points = model.predict(runs())
+    model.predict(runs(60))
+    torch.testing.assert_close(points, expected)
+    torch.testing.assert_close(model.predict(runs()), expected)
+    state = model.network.state_of(np.zeros((1, 3))) if kind is OneBufferSteps else None
+    if state is not None:
+        before = state.copy()
+        model.network.state_of(np.full((1, 3), 20.0))
+        np.testing.assert_array_equal(state, before)
+
+
+def test_a_callable_may_return_tensors_of_a_graph():
+    """As a network that is called without `torch.no_grad`."""
+    layer = torch.nn.Linear(3, 12).double()
+
+    class Net(Static):
+        def __call__(self, time_s, actuation):
+            return layer(torch.tensor(actuation)).view(-1, 4, 3)
+
+    class NetSteps(Net):
+        def initial_state(self, actuation):
+            return layer.weight[:1, :1] * torch.ones(len(actuation), 1)
+
+        def step(self, state, actuation, dt_s):
+            return torch.tensor(state) * layer.bias[0], self(dt_s, actuation)
+
+    pressure = torch.tensor([[4.0, 5.0, 6.0]])
+    expected = layer(pressure.double()).detach().view(4, 3)
+    for model in (around(Net(None), 4), around(NetSteps(None), 4)):
+        points = model.step(model.initial_state(1), pressure, 0.1)[1][0]
+        torch.testing.assert_close(points.double(), expected, atol=1e-5, rtol=1e-6)
+
+
 def test_whole_runs_are_not_stepped():
     model = around(WholeRuns())
     with pytest.raises(InputError, match="cannot be stepped"):

@@ -182,6 +182,17 @@ def raised_by(name: str, error: BaseException) -> InputError:
     )
 
 
+def as_numbers(value: Any) -> np.ndarray:
+    """What a callable returned, as an array of float64 of its own: a callable may use its array
+    again for the next answer. A tensor of PyTorch loses its graph.
+
+    Raises TypeError, ValueError or RuntimeError where it is no array of numbers.
+    """
+    if callable(getattr(value, "detach", None)):
+        value = value.detach().cpu().numpy()
+    return np.array(value, np.float64)
+
+
 def checked_points(
     name: str, points: Any, rows: tuple[int, ...], chambers: int, key_points: int | None
 ) -> np.ndarray:
@@ -190,8 +201,8 @@ def checked_points(
     rows: leading shape; chambers: m of the actuation that it was given; key_points: n, if known.
     """
     try:
-        points = np.asarray(points, np.float64)
-    except (TypeError, ValueError):
+        points = as_numbers(points)
+    except (TypeError, ValueError, RuntimeError):
         raise InputError(
             f"{name}: returned {type(points).__name__}, expected key points as an array of numbers"
         ) from None

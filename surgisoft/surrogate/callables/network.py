@@ -19,6 +19,7 @@ from surgisoft.errors import InputError
 from surgisoft.surrogate.callables import operators
 from surgisoft.surrogate.callables.named import (
     Named,
+    as_numbers,
     checked_points,
     no_graph,
     raised_by,
@@ -293,8 +294,8 @@ class CallableNetwork(nn.Module):
     def _state(self, state: Any, batch: int, width: int | None) -> np.ndarray:
         """A state (B, k) that the callable returned, or InputError."""
         try:
-            values = np.asarray(state, np.float64)
-        except (TypeError, ValueError):
+            values = as_numbers(state)
+        except (TypeError, ValueError, RuntimeError):
             raise InputError(
                 f"{self.name}: its state is a {type(state).__name__}, expected an array (B, k)"
             ) from None

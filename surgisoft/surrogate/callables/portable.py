@@ -41,21 +41,28 @@ class Called:
 
     def initial_state(self, actuation):
         """State (B, k) of arms that were held at actuation (B, m)."""
-        return np.asarray(self.model.initial_state(np.array(actuation, np.float64)), np.float64)
+        return _numbers(self.model.initial_state(np.array(actuation, np.float64)))
 
     def step(self, state, actuation, dt_s):
         """State (B, k), key points (B, n, 3) in mm after actuation (B, m) was held dt_s (B,)."""
         given = (np.array(each, np.float64) for each in (state, actuation, dt_s))
         fresh, points = self.model.step(*given)
-        return np.asarray(fresh, np.float64), self._checked(points, len(actuation))
+        return _numbers(fresh), self._checked(points, len(actuation))
 
     def _checked(self, points, rows):
-        points = np.asarray(points, np.float64)
+        points = _numbers(points)
         wanted = (rows, self.about["key_points"], 3)
         if points.shape != wanted or not np.isfinite(points).all():
             came = f"shape {points.shape}" if points.shape != wanted else "numbers not finite"
             raise ValueError(f"{self.about['name']}: key points have {came}, expected {wanted}, mm")
         return points
+
+
+def _numbers(value):
+    """An answer as an array of float64 of its own: a callable may use its array again."""
+    if hasattr(value, "detach"):  # a tensor of PyTorch
+        value = value.detach().cpu().numpy()
+    return np.array(value, np.float64)
 
 
 def found(name, sha256):

@@ -75,7 +75,19 @@ class Foreseeing(Arc):
         return super().__call__(time_s, actuation) + actuation[-1, 0]
 
 
+class InPlace(Stepped):
+    def initial_state(self, actuation):
+        actuation += 1.0
+        return super().initial_state(actuation)
+
+    def step(self, state, actuation, dt_s):
+        actuation += 1.0
+        dt_s *= 0.5
+        return super().step(state, actuation, dt_s)
+
+
 static, stepped, runs, foreseeing = Arc(), Stepped(), Runs(), Foreseeing()
+in_place = InPlace()
 """
 
 
@@ -124,6 +136,7 @@ def predicted(recording, folder, *arguments):
     [
         ("static", tuple(EFFECTS)),
         ("stepped", ("hysteresis", "creep")),
+        ("in_place", ("hysteresis",)),
         ("runs", ("hysteresis", "inertia")),
     ],
 )

@@ -274,18 +274,21 @@ class CallableNetwork(nn.Module):
         return answer
 
     def _points(self, time_s: np.ndarray, actuation: np.ndarray) -> np.ndarray:
-        points = self._call("__call__", time_s.copy(), actuation.copy())
+        points = self._call("__call__", time_s, actuation)
         rows = (len(actuation),)
         return checked_points(self.name, points, rows, actuation.shape[1], self.key_points)
 
     def _call(self, part: str, *arguments: np.ndarray) -> Any:
-        """Call a method of the callable; whatever it raises becomes an InputError."""
+        """Call a method of the callable; whatever it raises becomes an InputError.
+
+        It gets copies, which it may change.
+        """
         if torch.jit.is_tracing() or torch.compiler.is_compiling():
             raise self.no_graph()
         model = self.named.model
         method = model if part == "__call__" else getattr(model, part)
         try:
-            return method(*arguments)
+            return method(*(each.copy() for each in arguments))
         except InputError:
             raise
         except Exception as error:

@@ -199,6 +199,20 @@ class Late:
         return state, np.stack([2 * state[:, :1], 3 * state[:, 1:], 0 * state[:, :1]], -1)
 
 
+def test_the_methods_of_steps_are_used_in_a_subclass_of_a_static_callable():
+    """A third of the way to 10 in the first step: 2 * 3 and 3 * 3 mm."""
+
+    class Subclass(Late):
+        static = True
+
+        def __call__(self, time_s, actuation):
+            return np.zeros((len(actuation), 1, 3))
+
+    model = around(Subclass())
+    points = model.step(model.initial_state(1), torch.tensor([[10.0, 10.0]]), 0.1)[1]
+    torch.testing.assert_close(points[0, 0], torch.tensor([6.0, 9.0, 0.0]))
+
+
 def test_the_slope_of_a_callable_with_memory_is_that_of_an_offset():
     """An offset of the whole run moves the late model by its gain."""
     model = around(Late())

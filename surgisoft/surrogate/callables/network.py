@@ -40,11 +40,10 @@ whole runs."""
 
 
 def form_of(model: Any) -> Form:
-    """The kind of a callable model, by its attributes."""
-    if bool(getattr(model, "static", False)):
-        return "static"
-    steps = all(callable(getattr(model, part, None)) for part in ("initial_state", "step"))
-    return "steps" if steps else "runs"
+    """The kind of a callable model, by its attributes: the methods of steps come first."""
+    if all(callable(getattr(model, part, None)) for part in ("initial_state", "step")):
+        return "steps"
+    return "static" if bool(getattr(model, "static", False)) else "runs"
 
 
 class CallableNetwork(nn.Module):

@@ -405,7 +405,7 @@ def test_a_callable_may_return_tensors_of_a_graph():
             return layer.weight[:1, :1] * torch.ones(len(actuation), 1)
 
         def step(self, state, actuation, dt_s):
-            return torch.tensor(state) * layer.bias[0], self(dt_s, actuation)
+            return torch.as_tensor(state) * layer.bias[0], self(dt_s, actuation)
 
     pressure = torch.tensor([[4.0, 5.0, 6.0]])
     expected = layer(pressure.double()).detach().view(4, 3)

@@ -1,6 +1,7 @@
 """Models, callables and fits that cannot be meant: one line each."""
 
 import json
+import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -64,6 +65,7 @@ RANGE = {"low": [0.0, 0.0], "high": [9.0, 9.0]}
         ({"gravity": (0.0, 0.0, 2.0)}, "expected a unit vector of 3 numbers"),
         ({"actuation": "guessed"}, "expected one of measured, commanded"),
         ({"error_mm": [0.1, -0.1]}, "expected an RMS error above 0 mm, one or one for each key"),
+        ({"error_mm": []}, "expected an RMS error above 0 mm, one or one for each key"),
         ({"low": [0.0, 0.0]}, "states 'low' or 'high' only, expected both or none"),
         ({"low": [0.0, 0.0], "high": [9.0]}, "expected as many numbers in both, one for each"),
         ({"low": [0.0, 9.0], "high": [9.0, 9.0]}, "each low below its high"),
@@ -73,6 +75,43 @@ def test_what_a_callable_states_is_checked(stated, message):
     with pytest.raises(InputError) as error:
         statements(given_callable(Arm(**stated)))
     assert message in str(error.value)
+
+
+class Unmeasured(Arm):
+    @property
+    def length_mm(self):
+        raise RuntimeError("not measured yet")
+
+
+class Unsure(Arm):
+    @property
+    def static(self):
+        raise RuntimeError("not decided yet")
+
+
+class Leaving(Arm):
+    def __call__(self, time_s, actuation):
+        sys.exit(0)
+
+
+class LeavingLater(Arm):
+    def __call__(self, time_s, actuation):
+        return sys.exit(0) if actuation.any() else super().__call__(time_s, actuation)
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        (Unmeasured, r", attribute 'length_mm': raised RuntimeError in .* not measured yet"),
+        (Unsure, r", attribute 'static': raised RuntimeError in .* not decided yet"),
+        (Leaving, r": raised SystemExit in test_refusals.py line \d+: 0"),
+        (LeavingLater, r": raised SystemExit in test_refusals.py line \d+: 0"),
+    ],
+)
+def test_what_a_callable_raises_is_one_line(kind, message):
+    with pytest.raises(InputError, match=rf"{kind.__qualname__}{message}; correct the model$"):
+        arm = arm_by_itself(given_callable(kind(**RANGE)))
+        arm.network(torch.ones(1, 2), torch.ones(1, 2))
 
 
 def test_what_a_callable_states_becomes_the_model():

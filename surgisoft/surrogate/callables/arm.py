@@ -44,7 +44,7 @@ def _actuation(value: Any) -> str:
 
 def _errors(value: Any) -> tuple[float, ...]:
     array = np.atleast_1d(np.asarray(value, np.float64))
-    if array.ndim != 1 or not (np.isfinite(array) & (array > 0)).all():
+    if array.ndim != 1 or not len(array) or not (np.isfinite(array) & (array > 0)).all():
         raise ValueError("expected an RMS error above 0 mm, one or one for each key point")
     return tuple(array.tolist())
 
@@ -125,7 +125,7 @@ def _at_rest(named: Named, rest: np.ndarray) -> np.ndarray:
     """(n, 3) key points in mm of a callable at rest (m,)."""
     model, one = named.model, rest[None]
     try:
-        if form_of(model) == "steps":
+        if form_of(named) == "steps":
             result = model.step(model.initial_state(one.copy()), one.copy(), np.zeros(1))
             if not (isinstance(result, tuple | list) and len(result) == 2):
                 raise InputError(
@@ -137,6 +137,6 @@ def _at_rest(named: Named, rest: np.ndarray) -> np.ndarray:
             points = model(np.zeros(1), one.copy())
     except InputError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise raised_by(named.name, error) from error
     return checked_points(named.name, points, (1,), len(rest), None)[0]

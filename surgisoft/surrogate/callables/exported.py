@@ -113,7 +113,7 @@ def played(arm: Any, name: str, first: np.ndarray | None, rows: Sequence[np.ndar
             points.append(found[0])
     except InputError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise raised_by(name, error) from error
     return np.stack(points)
 

@@ -226,15 +226,25 @@ def checked_points(
     return points
 
 
+def read_attribute(name: str, model: Any, attribute: str) -> Any:
+    """The attribute of a callable, None without it; a property that raises is an InputError."""
+    try:
+        return getattr(model, attribute, None)
+    except InputError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise raised_by(f"{name}, attribute '{attribute}'", error) from error
+
+
 def stated(named: Named, known: Mapping[str, Any]) -> dict[str, Any]:
     """The attributes of a callable that say what it is a model of.
 
     known: attribute -> function that checks and converts its value. Raises InputError for a value
-    that it refuses.
+    that it refuses, and for a property that raises.
     """
     found = {}
     for attribute, convert in known.items():
-        value = getattr(named.model, attribute, None)
+        value = read_attribute(named.name, named.model, attribute)
         if value is None:
             continue
         try:
@@ -247,8 +257,8 @@ def stated(named: Named, known: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _check(name: str, value: Any) -> None:
-    stepped = all(callable(getattr(value, part, None)) for part in ("initial_state", "step"))
-    if not (callable(value) or stepped):
+    parts = (read_attribute(name, value, part) for part in ("initial_state", "step"))
+    if not (callable(value) or all(map(callable, parts))):
         raise InputError(
             f"{name}: is a {type(value).__name__}, expected a callable (time_s, actuation) -> key "
             "points, or an object with 'initial_state' and 'step' (docs/your_model.md)"

@@ -23,6 +23,7 @@ from surgisoft.surrogate.callables.named import (
     checked_points,
     no_graph,
     raised_by,
+    read_attribute,
     stored_callable,
 )
 from surgisoft.surrogate.history import History
@@ -39,11 +40,12 @@ Form = Literal["static", "steps", "runs"]
 whole runs."""
 
 
-def form_of(model: Any) -> Form:
+def form_of(named: Named) -> Form:
     """The kind of a callable model, by its attributes: the methods of steps come first."""
-    if all(callable(getattr(model, part, None)) for part in ("initial_state", "step")):
+    given = (named.name, named.model)
+    if all(callable(read_attribute(*given, part)) for part in ("initial_state", "step")):
         return "steps"
-    return "static" if bool(getattr(model, "static", False)) else "runs"
+    return "static" if bool(read_attribute(*given, "static")) else "runs"
 
 
 class CallableNetwork(nn.Module):
@@ -68,7 +70,7 @@ class CallableNetwork(nn.Module):
         super().__init__()
         self.named = named or stored_callable(name, sha256, name)
         self.key_points, self.name, self.sha256 = key_points, self.named.name, self.named.sha256
-        self.form: Form = form_of(self.named.model)
+        self.form: Form = form_of(self.named)
         self.step_size = DIFFERENCE * (high - low).where(high > low, torch.ones_like(low))
         self.cached: OrderedDict[bytes, np.ndarray] = OrderedDict()
         self._states: int | None = None
@@ -290,7 +292,7 @@ class CallableNetwork(nn.Module):
             return method(*(each.copy() for each in arguments))
         except InputError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise raised_by(self.name, error) from error
 
     def _state(self, state: Any, batch: int, width: int | None) -> np.ndarray:

@@ -9,7 +9,7 @@ import functools
 import hashlib
 import importlib.util
 import sys
-from collections.abc import Container, Iterable
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -36,7 +36,9 @@ class EffectFile:
 
 
 FILES: dict[str, EffectFile] = {}
-"""Registered effects from files, by name."""
+"""Registered effects from files, by name: the file that was named last."""
+FILE_OF: dict[type[Effect], EffectFile] = {}
+"""The file that each class came from, also after another file of its name was registered."""
 
 
 def register_effect_file(path: str | Path, taken: Container[str] = ()) -> str:
@@ -82,6 +84,7 @@ def register_effect_file(path: str | Path, taken: Container[str] = ()) -> str:
         raise InputError(f"{path}: expected one complete Effect in the file, found {names}")
     _check(made[0], str(path))
     FILES[name] = EffectFile(made[0], str(path), hashlib.sha256(content).hexdigest())
+    FILE_OF[made[0]] = FILES[name]
     return name
 
 
@@ -124,12 +127,16 @@ def _check(kind, label: str) -> None:
         raise InputError(f"{label}: expected a 'stage' of {', '.join(STAGES)}")
 
 
-def files_of(names: Iterable[str]) -> dict[str, dict]:
-    """Path and hash, by name, of those named effects that came from files, for a checkpoint."""
+def files_of(effects: Mapping[str, Effect]) -> dict[str, dict]:
+    """Path and hash, by name, of those effects that came from files, for a checkpoint.
+
+    They are those of the file as it was when the effect was made.
+    """
+    found = {kind_of(name): FILE_OF.get(type(effect)) for name, effect in effects.items()}
     return {
-        kind: {"path": FILES[kind].path, "sha256": FILES[kind].sha256}
-        for kind in map(kind_of, names)
-        if kind in FILES
+        name: {"path": file.path, "sha256": file.sha256}
+        for name, file in found.items()
+        if file is not None
     }
 
 

@@ -183,6 +183,24 @@ def test_opening_a_model_runs_no_code_of_it(slack, tmp_path):
     assert torch.equal(one, other)
 
 
+def test_a_model_is_saved_with_the_file_that_its_effect_came_from(slack, tmp_path):
+    """Its formula is not the one of the edited file that was named since."""
+    register_effect_file(slack)
+    saved = arm()
+    edited = EXAMPLE.replace("clamp(max=0)", "clamp(min=0)")
+    assert edited != EXAMPLE
+    slack.write_text(edited)
+    register_effect_file(slack)
+    save_model(saved, tmp_path / "model")
+    with pytest.raises(InputError, match="not the file that its effect 'slack' was made with"):
+        load_model(tmp_path / "model")
+    slack.write_text(EXAMPLE)
+    opened = load_model(tmp_path / "model", effect_files=[slack])
+    pressure = torch.tensor([[-5.0, 3.0, 30.0]])
+    one, other = (m.step(m.initial_state(), pressure, 0.1)[1] for m in (saved, opened))
+    assert torch.equal(one, other)
+
+
 @pytest.mark.parametrize(
     ("name", "text", "complaint"),
     [

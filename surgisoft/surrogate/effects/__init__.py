@@ -3,7 +3,8 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-from surgisoft.errors import unknown_name
+from surgisoft.errors import InputError, unknown_name
+from surgisoft.files import resolved
 from surgisoft.surrogate.effects import user_defined
 from surgisoft.surrogate.effects.base import (
     FRONT,
@@ -95,8 +96,19 @@ def register_effect_file(path: str | Path) -> str:
 
 
 def register_effect_files(paths: Iterable[str | Path]) -> None:
-    """Run several files of user-defined effects, as `register_effect_file` runs one."""
-    for path in paths:
+    """Run several files of user-defined effects, as `register_effect_file` runs one.
+
+    Raises InputError where two of them have one name, because only one could be used.
+    """
+    given: dict[str, Path] = {}
+    for path in map(Path, paths):
+        first = given.setdefault(path.stem, path)
+        if resolved(first) != resolved(path):
+            raise InputError(
+                f"{path}: {first} is an effect '{path.stem}', too, expected files of different "
+                "names; rename one of the two"
+            )
+    for path in given.values():
         register_effect_file(path)
 
 

@@ -19,8 +19,9 @@ from surgisoft.surrogate.effects.base import STAGES, Effect
 
 GROUP = "surgisoft.effects"
 """Entry point group of effects in other packages."""
-RESERVED = ("network", "none")
-"""Names with another meaning in a model, which no effect may have."""
+RESERVED = ("network", "none", "pressure", "direction", "constant curvature", "kernel", "auto")
+"""Names with another meaning in a model or its fit (`surgisoft.surrogate.fit`), which no effect may
+have."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,12 @@ def register_effect_file(path: str | Path, taken: Container[str] = ()) -> str:
         raise InputError(f"{path}: no such file; name a .py file that defines one Effect")
     if path.suffix != ".py" or not name.isidentifier():
         raise InputError(f"{path}: expected a .py file whose stem is a plain name (my_effect.py)")
-    if name in taken or name in RESERVED or name in offered():
+    if name in RESERVED:
+        raise InputError(
+            f"{path}: '{name}' has another meaning in a model, and no effect can have this name; "
+            "rename the file"
+        )
+    if name in taken or name in offered():
         raise InputError(f"{path}: an effect '{name}' exists already; rename the file")
     content = path.read_bytes()
     module_name = f"surgisoft_effect_{name}"

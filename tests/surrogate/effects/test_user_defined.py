@@ -18,6 +18,7 @@ from surgisoft.surrogate.effects import (
     make_effect,
     named_effect,
     register_effect_file,
+    register_effect_files,
     user_defined,
 )
 from surgisoft.surrogate.model import ArmModel, Validation
@@ -205,7 +206,10 @@ def test_a_model_is_saved_with_the_file_that_its_effect_came_from(slack, tmp_pat
     ("name", "text", "complaint"),
     [
         ("creep.py", EXAMPLE, "an effect 'creep' exists already"),
-        ("network.py", EXAMPLE, "an effect 'network' exists already"),
+        ("network.py", EXAMPLE, "'network' has another meaning in a model"),
+        ("direction.py", EXAMPLE, "'direction' has another meaning in a model"),
+        ("pressure.py", EXAMPLE, "'pressure' has another meaning in a model"),
+        ("auto.py", EXAMPLE, "'auto' has another meaning in a model"),
         ("my-effect.py", EXAMPLE, "plain name"),
         ("empty.py", "x = 1", "expected one complete Effect in the file, found none"),
         ("broken.py", "1 / 0", r"does not run \(ZeroDivisionError"),
@@ -219,6 +223,19 @@ def test_a_bad_file_is_refused_in_one_line_and_leaves_nothing(tmp_path, name, te
     with pytest.raises(InputError, match=complaint):
         register_effect_file(tmp_path / name)
     assert not user_defined.FILES
+
+
+def test_two_files_of_one_name_are_refused(slack, tmp_path):
+    """The second would take the place of the first; one file by two paths is one."""
+    other = tmp_path / "other" / "slack.py"
+    other.parent.mkdir()
+    other.write_text(EXAMPLE)
+    message = f"{other}: {slack} is an effect 'slack', too, expected files of different names"
+    with pytest.raises(InputError, match=re.escape(message)):
+        register_effect_files([slack, other])
+    assert not user_defined.FILES
+    register_effect_files([slack, other.parent / ".." / "slack.py"])
+    assert user_defined.FILES["slack"].path == str(slack)
 
 
 def test_a_missing_file_is_refused():

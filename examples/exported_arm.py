@@ -34,9 +34,13 @@ start, step = functions(folder, about, (sys.argv[3:] or ["onnxruntime"])[0])
 rows = list(csv.DictReader(Path(sys.argv[2]).read_text().splitlines()))
 pressure = np.array([[float(row[name]) for name in about["recording_columns"]] for row in rows])
 time = np.array([float(row["t_s"]) for row in rows])
-(state,) = start(pressure[:1])
+run = np.array([int(row.get("run") or 0) for row in rows])
+begins = np.diff(run, prepend=run[0] - 1) != 0  # each run starts anew, at its own first row
 warm = np.array([float(row.get("temp_C") or "nan") for row in rows])
-for now, dt, temperature in zip(pressure, np.diff(time, prepend=time[0]), warm, strict=True):
+steps = np.where(begins, 0.0, np.diff(time, prepend=time[0]))
+for now, dt, temperature, begin in zip(pressure, steps, warm, begins, strict=True):
+    if begin:
+        (state,) = start(now[None])
     warmth = [np.array([temperature])] * ("temperature_C" in about["step"]["inputs"])
     state, points = step(state, now[None], np.array([dt]), *warmth)
     print(",".join(f"{value:.9f}" for value in np.asarray(points).ravel()))

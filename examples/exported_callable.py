@@ -27,8 +27,12 @@ rows = list(csv.DictReader(Path(sys.argv[2]).read_text().splitlines()))
 pressure = np.array([[float(row[name]) for name in about["recording_columns"]] for row in rows])
 time = np.array([float(row["t_s"]) for row in rows])
 warm = np.array([float(row.get("temp_C") or "nan") for row in rows])
+run = np.array([int(row.get("run") or 0) for row in rows])
+begins = np.diff(run, prepend=run[0] - 1) != 0  # each run starts anew, at its own first row
+steps = np.where(begins, 0.0, np.diff(time, prepend=time[0]))
 
-state = arm.start(pressure[:1])
-for now, dt, temperature in zip(pressure, np.diff(time, prepend=time[0]), warm, strict=True):
+for now, dt, temperature, begin in zip(pressure, steps, warm, begins, strict=True):
+    if begin:
+        state = arm.start(now[None])
     state, points = arm.step(state, now[None], dt, temperature)
     print(",".join(f"{value:.9f}" for value in points.ravel()))

@@ -65,6 +65,20 @@ def bench(tmp_path_factory):
     return folder / "bench.csv", recording
 
 
+@pytest.fixture(scope="module")
+def two_runs(bench, tmp_path_factory):
+    """The same rows as two runs: the second one begins at another place, without a past.
+
+    The clock begins anew, too, as the drift of a started arm does.
+    """
+    run = (np.arange(bench[1].samples) >= 45).astype(int)
+    t_s = bench[1].t_s - np.where(run, bench[1].t_s[45], 0.0)
+    recording = replace(bench[1], name="two_runs", run=run, t_s=t_s)
+    file = tmp_path_factory.mktemp("runs") / "two_runs.csv"
+    save_recording(recording, file)
+    return file, recording
+
+
 def _tuple_of(found):
     return found if isinstance(found, tuple) else (found,)
 
@@ -157,7 +171,7 @@ def test_the_step_takes_any_batch_and_the_state_is_what_arm_json_says(exported):
 
 
 @pytest.mark.parametrize("engine", ["torch", "onnx"])
-def test_the_example_predicts_a_recording_without_surgisoft(engine, exported, bench, tmp_path):
+def test_the_example_predicts_a_recording_without_surgisoft(engine, exported, two_runs, tmp_path):
     model, folder = exported
     other = "onnx" if engine == "torch" else "torch"
     blocked = (
@@ -166,7 +180,7 @@ def test_the_example_predicts_a_recording_without_surgisoft(engine, exported, be
     )
     example = ROOT / "examples" / "exported_arm.py"
     done = subprocess.run(
-        [sys.executable, "-c", blocked, example, folder, bench[0], engine],
+        [sys.executable, "-c", blocked, example, folder, two_runs[0], engine],
         capture_output=True,
         text=True,
         check=True,
@@ -174,7 +188,8 @@ def test_the_example_predicts_a_recording_without_surgisoft(engine, exported, be
         env={k: v for k, v in os.environ.items() if k != "PYTHONPATH"},
     )
     found = np.array([line.split(",") for line in done.stdout.splitlines()], float)
-    expected = model.double().predict(exact(bench[1]))[0].detach().flatten(1).numpy()
+    history = exact(two_runs[1])
+    expected = history.rows(model.double().predict(history)).detach().flatten(1).numpy()
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 

@@ -20,7 +20,7 @@ from surgisoft.surrogate.callables.named import named_callable
 from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.effects import EFFECTS, make_effect
 from surgisoft.surrogate.export import CALLABLE_FILES, differences, export_arm
-from tests.surrogate.test_export import SMALL, Stuck, bench, exact  # noqa: F401  # a fixture
+from tests.surrogate.test_export import SMALL, Stuck, bench, exact, two_runs  # noqa: F401  # fixtures
 
 ROOT = Path(__file__).resolve().parents[2]
 MODELS = """
@@ -154,6 +154,13 @@ def test_the_file_predicts_a_recording_as_the_model_does(name, effects, bench): 
     bare = arm_by_itself(named_callable(f"arms.py:{name}")).double().predict(exact(bench[1]))
     assert np.abs(expected - bare[0].numpy()).max() > 1.0, "the effects change nothing"
     np.testing.assert_allclose(predicted(bench[0], "arm"), expected, atol=1e-5)
+
+
+def test_the_example_begins_every_run_anew(two_runs):  # noqa: F811
+    model, history = wrapped("stepped", ("hysteresis", "creep")), exact(two_runs[1])
+    export_arm(model, "arm")
+    expected = history.rows(model.double().predict(history)).numpy()
+    np.testing.assert_allclose(predicted(two_runs[0], "arm"), expected, atol=1e-5)
 
 
 def test_the_command_exports_an_amended_callable(bench, capsys):  # noqa: F811

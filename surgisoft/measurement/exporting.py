@@ -6,7 +6,9 @@ from surgisoft.measurement.fitting import Recordings
 from surgisoft.measurement.histories import check_fits, history_of
 from surgisoft.measurement.recordings import load_recordings
 from surgisoft.surrogate.checkpoint import load_model
+from surgisoft.surrogate.effects import free_name
 from surgisoft.surrogate.export import export_arm as export_histories
+from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel
 
 
@@ -28,5 +30,8 @@ def export_arm(
     none = isinstance(recordings, list | tuple) and not recordings
     arm, measured = load_model(model), [] if none else load_recordings(recordings)
     check_fits(arm.spec, measured)
-    histories = {each.name: history_of([each], arm.spec.actuation) for each in measured}
+    names, histories = [each.name for each in measured], dict[str, History]()
+    for each in measured:
+        called = each.name if names.count(each.name) == 1 else each.label
+        histories[free_name(called, histories)] = history_of([each], arm.spec.actuation)
     return export_histories(arm, folder, histories)

@@ -79,6 +79,10 @@ def two_runs(bench, tmp_path_factory):
     return file, recording
 
 
+ROWS = ("t_s", "measured", "commanded", "key_points_mm", "run", "temp_C")
+"""Fields of a recording with a value for each row."""
+
+
 def _tuple_of(found):
     return found if isinstance(found, tuple) else (found,)
 
@@ -148,6 +152,15 @@ def test_files_are_compared_over_whole_recordings(bench, tmp_path, capsys, monke
     found = differences(tmp_path / "arm")["two"]
     assert found["rows"] == 80
     assert 0.0 < found["largest_difference_mm"] < 1e-5
+    for place, rows in (("before", 30), ("after", 20)):
+        (tmp_path / place).mkdir()
+        part = {n: getattr(recording, n)[:rows] for n in ROWS if getattr(recording, n) is not None}
+        save_recording(replace(recording, **part), tmp_path / place / "bench.csv")
+    again = [tmp_path / "before", tmp_path / "after", tmp_path / "two.csv"]
+    export_recordings(tmp_path / "small", tmp_path / "again", again)
+    rows = {name: found["rows"] for name, found in differences(tmp_path / "again").items()}
+    files = [str(tmp_path / place / "bench.csv") for place in ("before", "after")]
+    assert rows == {files[0]: 30, files[1]: 20, "two": 80}, "recordings of one name go by path"
     save_recording(replace(recording, unit="psi"), tmp_path / "psi.csv")
     with pytest.raises(InputError, match="psi, but the model has kPa"):
         export_recordings(tmp_path / "small", tmp_path / "new", tmp_path / "psi.csv")

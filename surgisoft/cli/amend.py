@@ -96,10 +96,10 @@ def amend(
 
     from surgisoft.diagnosis.amend import amend as amend_model
     from surgisoft.surrogate.checkpoint import save_model
-    from surgisoft.surrogate.effects import named_effect
+    from surgisoft.surrogate.effects import named_effects
 
     # Files of effects first: the model may hold one of them.
-    names = [named_effect(name) for given in effects for name in given.split(",") if name]
+    names = named_effects(name for given in effects for name in given.split(",") if name)
     with progress("amend") as tell:
         stages = iter(range(100))
         result = amend_model(

@@ -31,7 +31,7 @@ from surgisoft.files import with_former_keys
 from surgisoft.measurement.recordings import load_recordings
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
-from surgisoft.surrogate.effects import named_effect
+from surgisoft.surrogate.effects import named_effects
 from surgisoft.surrogate.fitted_rows import FittedRows, Use
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.workers import torch_threads
@@ -327,7 +327,7 @@ def amend(
     """
     begin = time.perf_counter()
     tell = progress or (lambda text: None)
-    names = [named_effect(given) for given in ([effects] if isinstance(effects, str) else effects)]
+    names = named_effects([effects] if isinstance(effects, str) else effects)
     if not names:
         raise InputError(
             "no effect is named to amend the model with, expected at least one, such as creep; "

@@ -14,7 +14,7 @@ from surgisoft.measurement.histories import arm_spec, check_fits, history_of
 from surgisoft.measurement.jumps import Motion, own_level_mm
 from surgisoft.measurement.noise import hold_noise, stated_noise
 from surgisoft.measurement.recordings import Recording, check_same_arm, load_recordings
-from surgisoft.surrogate.effects import named_effect
+from surgisoft.surrogate.effects import named_effects
 from surgisoft.surrogate.fit import AUTO, FitConfig, FitResult
 from surgisoft.surrogate.fit import fit as fit_histories
 from surgisoft.surrogate.fitted_rows import FittedRows, row_hashes
@@ -60,7 +60,8 @@ def fit(
     """
     config = replace(config or FitConfig(), **fields)
     effects = [config.effects] if isinstance(config.effects, str) else config.effects
-    chosen = tuple(name if name == AUTO else named_effect(name) for name in effects)
+    names = iter(named_effects(name for name in effects if name != AUTO))
+    chosen = tuple(name if name == AUTO else next(names) for name in effects)
     config = replace(config, effects=chosen, hidden=tuple(config.hidden))
     train = load_recordings(recordings)
     held = None if valid is None else load_recordings(valid)

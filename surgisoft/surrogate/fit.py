@@ -23,7 +23,7 @@ from torch import Tensor
 from surgisoft.errors import InputError, Interrupted, unknown_name
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.chain import Taps
-from surgisoft.surrogate.effects import FRONT, hypothesis_of, known_effects, make_effect
+from surgisoft.surrogate.effects import FRONT, free_name, hypothesis_of, known_effects, make_effect
 from surgisoft.surrogate.ensemble import train_ensemble
 from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.history import History
@@ -427,11 +427,12 @@ def _fit_stages(data: Data, spec, config, support, result: FitResult, progress) 
         if name == AUTO:
             _add_memory(data, spec, config, support, result, progress)
             continue
+        epochs = _stage_epochs(name, grown, config)
         if result.model is None:
             candidate = _first(name, spec, config, data, result)
         else:
+            name = free_name(name, result.model.effects)  # a second creep is `creep#2`
             candidate = _grow(result.model, name, spec, config, support, data)
-        epochs = _stage_epochs(name, grown, config)
         _stage(candidate, name, epochs, config, data, result, progress)
         if name == "pressure" and config.prior is None:
             _compare_alone(spec, epochs, config, data, result, progress)

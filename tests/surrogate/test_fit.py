@@ -517,6 +517,18 @@ def test_auto_adds_two_effects_at_most_of_a_tenth_of_the_squared_error(monkeypat
     assert sorted(result.model.effects) == sorted(added)
 
 
+def test_an_effect_that_is_named_twice_is_added_twice(monkeypatch):
+    """The first one stays; each halves the error."""
+    prescribed(monkeypatch, {"creep": 0.5, "without creep#2": 0.5, "creep#2": 0.25})
+    config = FitConfig(
+        hidden=(4,), prior="none", inputs="pressure", effects=("creep", "creep"), batch=64
+    )
+    result = fit(at(np.zeros(100)), at(np.zeros(250)), SPEC, replace(config, check_excitation=False))
+    assert [stage.name for stage in result.stages] == ["pressure", "creep", "creep#2"]
+    assert list(result.model.effects) == ["creep", "creep#2"]
+    assert result.model.validation.rmse_mm == pytest.approx(0.25)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -72,6 +72,7 @@ __all__ = [
     "known_effects",
     "make_effect",
     "named_effect",
+    "named_effects",
     "register_effect_file",
     "register_effect_files",
     "registered_files",
@@ -100,6 +101,12 @@ def register_effect_files(paths: Iterable[str | Path]) -> None:
 
     Raises InputError where two of them have one name, because only one could be used.
     """
+    for path in _of_different_names(paths):
+        register_effect_file(path)
+
+
+def _of_different_names(paths: Iterable[str | Path]) -> list[Path]:
+    """The files without repeats; raises InputError where two of them are effects of one name."""
     given: dict[str, Path] = {}
     for path in map(Path, paths):
         first = given.setdefault(path.stem, path)
@@ -108,8 +115,7 @@ def register_effect_files(paths: Iterable[str | Path]) -> None:
                 f"{path}: {first} is an effect '{path.stem}', too, expected files of different "
                 "names; rename one of the two"
             )
-    for path in given.values():
-        register_effect_file(path)
+    return list(given.values())
 
 
 def registered_files() -> list[str]:
@@ -117,9 +123,20 @@ def registered_files() -> list[str]:
     return [file.path for file in user_defined.FILES.values()]
 
 
+def named_effects(given: Iterable[str]) -> list[str]:
+    """The names of effects, each given as to `named_effect`; files have to have different names."""
+    given = list(given)
+    _of_different_names(each for each in given if _is_file(each))
+    return [named_effect(each) for each in given]
+
+
+def _is_file(given: str) -> bool:
+    return given.endswith(".py") or "/" in given
+
+
 def named_effect(given: str) -> str:
     """The name of an effect given by name or by path (`path/to/my_effect.py`, which is run)."""
-    if given.endswith(".py") or "/" in given:
+    if _is_file(given):
         return register_effect_file(given)
     known = known_effects()
     if given not in known:

@@ -17,6 +17,7 @@ from surgisoft.surrogate.effects import (
     known_effects,
     make_effect,
     named_effect,
+    named_effects,
     register_effect_file,
     register_effect_files,
     user_defined,
@@ -233,6 +234,9 @@ def test_two_files_of_one_name_are_refused(slack, tmp_path):
     message = f"{other}: {slack} is an effect 'slack', too, expected files of different names"
     with pytest.raises(InputError, match=re.escape(message)):
         register_effect_files([slack, other])
+    assert not user_defined.FILES
+    with pytest.raises(InputError, match=re.escape(message)):
+        named_effects(["creep", str(slack), str(other)])
     assert not user_defined.FILES
     register_effect_files([slack, other.parent / ".." / "slack.py"])
     assert user_defined.FILES["slack"].path == str(slack)

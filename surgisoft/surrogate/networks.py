@@ -6,11 +6,13 @@ HAW-NN is the Hysteresis-Aware Whole-body Neural Network of Chen et al. (2025, s
 import itertools
 import math
 from collections.abc import Callable, Sequence
+from numbers import Integral
 from typing import cast
 
 import torch
 from torch import Tensor, nn
 
+from surgisoft.config import describe
 from surgisoft.errors import InputError
 from surgisoft.surrogate.arm import centre_and_half
 from surgisoft.surrogate.history import History
@@ -23,15 +25,35 @@ MOST_STRETCH = math.log(10.0)
 long; actuation in another unit than the model's would make lengths that are not finite."""
 
 
+MOST_WIDTH, MOST_LAYERS = 4096, 32
+"""Largest width of a hidden layer, and most of them: two such layers have 17 million weights, more
+than any recording can determine."""
+
+
 def parse_widths(text: str) -> tuple[int, ...]:
     """Widths of hidden layers from text such as `128,128`."""
     try:
         widths = tuple(int(word) for word in text.replace("x", ",").split(","))
     except ValueError:
         widths = ()
-    if not widths or min(widths) < 1:
-        raise InputError(f"hidden widths '{text}': expected whole numbers such as 128,128,128,128")
+    check_widths(widths, f"'{text}'")
     return widths
+
+
+def check_widths(widths: object, shown: str | None = None) -> None:
+    """Raise InputError unless the widths of hidden layers are whole numbers within the limits."""
+    each = list(widths) if isinstance(widths, tuple | list) else []
+    if not 1 <= len(each) <= MOST_LAYERS or not all(map(_fits, each)):
+        raise InputError(
+            f"hidden widths {shown or describe(widths)}: expected whole numbers such as "
+            f"128,128,128,128, 1 to {MOST_LAYERS} of them from 1 to {MOST_WIDTH}"
+        )
+
+
+def _fits(width: object) -> bool:
+    """Whether a hidden layer can have this width; a number of NumPy is a whole number, too."""
+    whole = isinstance(width, Integral) and not isinstance(width, bool)
+    return whole and 1 <= int(cast(int, width)) <= MOST_WIDTH
 
 
 def stretched(stretch: Tensor) -> Tensor:

@@ -63,8 +63,10 @@ def test_added_directions_change_nothing_at_first():
 
 def test_widths_are_read_or_refused():
     assert parse_widths("64x32") == (64, 32)
-    with pytest.raises(InputError, match="whole numbers"):
-        parse_widths("64,many")
+    for wrong in ("64,many", "8,,8", "0", "-8", "4097", "9999999,9999999", ",".join(["8"] * 33)):
+        with pytest.raises(InputError, match=rf"hidden widths '{wrong}': expected whole numbers"):
+            parse_widths(wrong)
+    assert parse_widths("4096," * 31 + "1") == (4096,) * 31 + (1,)
 
 
 def test_arc_point_in_closed_form():

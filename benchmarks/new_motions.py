@@ -59,6 +59,8 @@ def judged(generator: Generator, folder: Path, robot: int, kind: str) -> dict[st
     """Errors (mm) of one fit: `validated`, and that on each schedule of AFTER."""
     place = robot_folder(folder, str(robot))
     budget = json.loads((place / "robot.json").read_text()).get("fit", {})
+    if kind == "kernel":  # which has no options of its own
+        budget = {}
     model = fit(place / "before", **budget | KINDS[kind]).model
     found = {after: error_mm(model, generator, robot, after) for after in AFTER}
     return {"validated": model.validation.rmse_mm or math.nan} | found

@@ -229,7 +229,9 @@ def read_raw(sample: Path) -> None:
 def _model(**fields):
     import surgisoft
 
-    return surgisoft.fit([recording()], hidden=(6, 6), epochs=2, **fields).model
+    small = {"haw_nn": {"hidden": (6, 6), "epochs": 2}, "kernel": {}}
+    own = small.get(fields.get("network", "haw_nn"), {"epochs": 2})
+    return surgisoft.fit([recording()], **own, **fields).model
 
 
 def make_models(folder: Path) -> None:

@@ -15,7 +15,7 @@ from surgisoft.measurement.jumps import Motion, own_level_mm
 from surgisoft.measurement.noise import hold_noise, stated_noise
 from surgisoft.measurement.recordings import Recording, check_same_arm, load_recordings
 from surgisoft.surrogate.effects import named_effects
-from surgisoft.surrogate.fit import AUTO, FitConfig, FitResult
+from surgisoft.surrogate.fit import AUTO, FitConfig, FitResult, check_config
 from surgisoft.surrogate.fit import fit as fit_histories
 from surgisoft.surrogate.fitted_rows import FittedRows, row_hashes
 from surgisoft.surrogate.model import ArmModel
@@ -43,7 +43,8 @@ def fit(
 
     The model (Chen et al. 2025) maps actuation (T, m), in the recordings' unit, to key points
     (T, n, 3) mm in the arm base frame. Raises InputError where the recordings are of different
-    arms, too short, have rows in common, or hold numbers that are not finite. Ctrl-C raises `Interrupted`
+    arms, too short, have rows in common, or hold numbers that are not finite, and for settings that
+    are out of range or that the network does not have. Ctrl-C raises `Interrupted`
     (`surgisoft.errors`), whose `result` has the best model so far, or KeyboardInterrupt before the
     first validation.
 
@@ -59,7 +60,10 @@ def fit(
     the path of a file with a user-defined one, which is run.
     """
     config = replace(config or FitConfig(), **fields)
-    effects = [config.effects] if isinstance(config.effects, str) else config.effects
+    if isinstance(config.effects, str):
+        config = replace(config, effects=(config.effects,))
+    check_config(config)
+    effects = config.effects
     names = iter(named_effects(name for name in effects if name != AUTO))
     chosen = tuple(name if name == AUTO else next(names) for name in effects)
     config = replace(config, effects=chosen, hidden=tuple(config.hidden))

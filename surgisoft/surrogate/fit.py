@@ -12,6 +12,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from scipy.spatial import cKDTree
 from scipy.special import stdtrit
 from torch import Tensor
 
+from surgisoft.config import describe
 from surgisoft.errors import InputError, Interrupted, unknown_name
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.chain import Taps
@@ -37,6 +39,7 @@ from surgisoft.surrogate.networks import (
     HawNN,
     KernelArm,
     RecurrentArm,
+    check_widths,
 )
 from surgisoft.surrogate.prior_mean import arcs_of, fit_prior_mean
 from surgisoft.surrogate.scan import direction_scan
@@ -178,6 +181,14 @@ GREY_BOXES = ("haw_nn", "auto")
 """Networks that a prior mean, members and effects are options of."""
 PRIORS = ("none", "arcs")
 INPUTS = ("pressure", "pressure+direction")
+IGNORED = {
+    "kernel": ("inputs", "hidden", "sections", "epochs", "batch", "learning_rate"),
+    "constant_curvature": ("hidden",),
+    "recurrent": ("hidden", "sections", "batch"),
+}
+"""Settings of a fit (`FitConfig`) that a network does not have."""
+OPTIONS = {"inputs": "--inputs", "hidden": "--widths", "epochs": "--epochs"}
+"""Options of `surgisoft fit` for those settings, where their name is another."""
 SIMPLE_SHARE = 0.2
 """Share of the epochs for a stage that precedes others, or comes after an effect."""
 EFFECT_SHARE = 0.5
@@ -191,6 +202,15 @@ MEMBER_SHARE = 1.0
 """Share of the epochs for which the members of an ensemble are trained, all at once."""
 MOST_MEMBERS = 50
 """Most members of an ensemble."""
+WHOLE_NUMBERS = {
+    "members": (1, MOST_MEMBERS),
+    "sections": (0, 100),
+    "epochs": (1, 10**9),
+    "batch": (1, 10**9),
+    "seed": (0, 2**63 - 1),
+}
+"""Least and largest value of those settings of a fit that are whole numbers; a random number
+generator of torch takes no larger seed, and no arm has more sections."""
 MOST_AUTO = 2
 """Most effects that `auto` adds."""
 AUTO_GAIN = 0.1
@@ -540,11 +560,67 @@ def _fit_recurrent(data: Data, spec, config, result: FitResult, progress) -> Non
     result.stages.append(StageReport("recurrent", error_mm, epochs, 0.0, True))
 
 
+def check_config(config: FitConfig) -> None:
+    """Raise InputError where settings of a fit are of a wrong type, out of range or of no effect.
+
+    Names of effects are checked when the arm is known.
+    """
+    for name, (least, most) in WHOLE_NUMBERS.items():
+        value = getattr(config, name)
+        whole = isinstance(value, Integral) and not isinstance(value, bool)
+        if not whole or not least <= value <= most:
+            raise InputError(
+                f"'{name}' of a fit is {describe(value)}, expected a whole number from {least} "
+                f"to {most}"
+            )
+    rate = config.learning_rate
+    if not (isinstance(rate, Real) and 0 < rate < math.inf) or isinstance(rate, bool):
+        raise InputError(
+            f"'learning_rate' of a fit is {describe(rate)}, expected a finite number above 0"
+        )
+    if not isinstance(config.check_excitation, bool):
+        raise InputError(
+            f"'check_excitation' of a fit is {describe(config.check_excitation)}, expected a "
+            "boolean"
+        )
+    check_widths(config.hidden)
+    effects = config.effects
+    if not isinstance(effects, tuple | list) or not all(isinstance(x, str) for x in effects):
+        raise InputError(
+            f"'effects' of a fit is {describe(effects)}, expected names of effects, such as "
+            "['hysteresis']"
+        )
+    _check_network(config)
+
+
+def _plain(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _check_network(config: FitConfig) -> None:
+    """Raise InputError for an unknown network, or settings that the network does not have."""
+    if config.network not in NETWORKS:
+        raise unknown_name("network", str(config.network), NETWORKS)
+    standard = FitConfig()
+    set_by_user = [
+        name
+        for name in IGNORED.get(config.network, ())
+        if _plain(getattr(config, name)) != getattr(standard, name)
+    ]
+    if config.network == "kernel" and config.prior == "none":
+        set_by_user.append("prior")
+    if set_by_user:
+        names = ", ".join(OPTIONS.get(name, name) for name in set_by_user)
+        raise InputError(
+            f"the network {config.network} has no setting {names}: expected a fit without; leave "
+            "it out, or fit the network haw_nn"
+        )
+
+
 def _check(train: History, valid: History | None, spec: ArmSpec, config: FitConfig) -> None:
+    check_config(config)
     if config.prior not in (None, *PRIORS):
         raise unknown_name("prior mean", str(config.prior), PRIORS)
-    if config.network not in NETWORKS:
-        raise unknown_name("network", config.network, NETWORKS)
     if config.prior == "arcs" and config.network not in (*GREY_BOXES, "kernel"):
         raise InputError(
             f"a prior mean needs the network haw_nn, not {config.network}; change one of the two"
@@ -552,8 +628,6 @@ def _check(train: History, valid: History | None, spec: ArmSpec, config: FitConf
     if config.inputs not in INPUTS:
         raise unknown_name("inputs", config.inputs, INPUTS)
     known = known_effects()
-    if not 1 <= config.members <= MOST_MEMBERS:
-        raise InputError(f"{config.members} members, expected 1 to {MOST_MEMBERS}")
     if config.members > 1 and config.network not in GREY_BOXES:
         raise InputError(
             f"an ensemble needs the network haw_nn, not {config.network}; change one of the two"

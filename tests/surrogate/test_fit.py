@@ -220,10 +220,47 @@ def test_recurrent_baseline_learns(walks):
     [
         ({"inputs": "smell"}, "unknown inputs 'smell'"),
         ({"effects": ("ghost",)}, "unknown effect 'ghost'"),
+        ({"effects": None}, "'effects' of a fit is value None, expected names of effects"),
+        ({"effects": "creep"}, "'effects' of a fit is text 'creep', expected names of effects"),
+        ({"epochs": 0}, "'epochs' of a fit is integer 0, expected a whole number from 1"),
+        ({"epochs": "20"}, "'epochs' of a fit is text '20', expected a whole number from 1"),
+        ({"batch": 0}, "'batch' of a fit is integer 0, expected a whole number from 1"),
+        ({"seed": -1}, "'seed' of a fit is integer -1, expected a whole number from 0"),
+        ({"seed": 1.5}, "'seed' of a fit is number 1.5, expected a whole number from 0"),
+        ({"members": 2.5}, "'members' of a fit is number 2.5, expected a whole number from 1"),
+        ({"sections": -1}, "'sections' of a fit is integer -1, expected a whole number from 0"),
+        ({"learning_rate": 0}, "'learning_rate' of a fit is integer 0, expected a finite number"),
+        ({"learning_rate": np.nan}, "'learning_rate' of a fit is number nan, expected a finite"),
+        ({"check_excitation": "no"}, "'check_excitation' of a fit is text 'no', expected a"),
+        ({"hidden": ()}, "hidden widths value (): expected whole numbers"),
+        ({"hidden": 8}, "hidden widths integer 8: expected whole numbers"),
+        ({"hidden": (0,)}, "hidden widths value (0,): expected whole numbers"),
+        ({"hidden": (10**7, 10**7)}, "hidden widths value (10000000, 10000000): expected whole"),
+        ({"network": "svm"}, "unknown network 'svm'"),
     ],
 )
 def test_bad_configs_are_named(walks, change, message):
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match=re.escape(message)):
+        fit(walks[0], walks[1], SPEC, FitConfig(**change))
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"network": "kernel", "prior": "none"}, "kernel has no setting prior"),
+        ({"network": "kernel", "hidden": [8]}, "kernel has no setting --widths"),
+        ({"network": "kernel", "epochs": 3}, "kernel has no setting --epochs"),
+        ({"network": "kernel", "inputs": "pressure"}, "kernel has no setting --inputs"),
+        (
+            {"network": "kernel", "epochs": 1, "inputs": "pressure", "hidden": (8,)},
+            "kernel has no setting --inputs, --widths, --epochs",
+        ),
+        ({"network": "constant_curvature", "hidden": (8,)}, "curvature has no setting --widths"),
+        ({"network": "recurrent", "hidden": (8,)}, "recurrent has no setting --widths"),
+    ],
+)
+def test_settings_that_a_network_does_not_have_are_refused(walks, change, named):
+    with pytest.raises(InputError, match=f"{named}: expected a fit without"):
         fit(walks[0], walks[1], SPEC, FitConfig(**change))
 
 
@@ -523,7 +560,9 @@ def test_an_effect_that_is_named_twice_is_added_twice(monkeypatch):
     config = FitConfig(
         hidden=(4,), prior="none", inputs="pressure", effects=("creep", "creep"), batch=64
     )
-    result = fit(at(np.zeros(100)), at(np.zeros(250)), SPEC, replace(config, check_excitation=False))
+    result = fit(
+        at(np.zeros(100)), at(np.zeros(250)), SPEC, replace(config, check_excitation=False)
+    )
     assert [stage.name for stage in result.stages] == ["pressure", "creep", "creep#2"]
     assert list(result.model.effects) == ["creep", "creep#2"]
     assert result.model.validation.rmse_mm == pytest.approx(0.25)
@@ -532,7 +571,7 @@ def test_an_effect_that_is_named_twice_is_added_twice(monkeypatch):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"members": 0}, "0 members, expected 1 to"),
+        ({"members": 0}, "'members' of a fit is integer 0, expected a whole number from 1 to 50"),
         ({"members": 3, "network": "recurrent"}, "an ensemble needs the network haw_nn"),
     ],
 )

@@ -158,6 +158,8 @@ def test_a_recording_under_two_names_is_not_fitted_twice(pair):
         message = rf"^{given[-1].label}: {share} % of its rows are in {first.label}, expected"
         with pytest.raises(InputError, match=message):
             fit(given, **quick)
-    with pytest.raises(InputError, match=rf"^{first.label}: 20 % of its rows are in recording .cut."):
+    with pytest.raises(
+        InputError, match=rf"^{first.label}: 20 % of its rows are in recording .cut."
+    ):
         fit([part, first], **quick)
     assert fit([first, other, moved], **quick).model.fitted_rows.count == 4500

@@ -272,7 +272,7 @@ def test_a_network_has_a_prior_mean_unless_none_is_asked_for():
         assert result.model.network.arcs == arcs
         said = [line for line in result.lines() if line.startswith("prior mean: a chain of arcs")]
         assert len(said) == (arcs > 0)
-    baseline = fit(train, None, TWO, FitConfig(network="constant_curvature", **how)).model
+    baseline = fit(train, None, TWO, FitConfig(network="constant_curvature", epochs=10)).model
     assert baseline.network.sections == 1
 
 

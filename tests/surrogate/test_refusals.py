@@ -109,9 +109,11 @@ class LeavingLater(Arm):
     ],
 )
 def test_what_a_callable_raises_is_one_line(kind, message):
+    def asked():
+        return arm_by_itself(given_callable(kind(**RANGE))).network(*torch.ones(2, 1, 2))
+
     with pytest.raises(InputError, match=rf"{kind.__qualname__}{message}; correct the model$"):
-        arm = arm_by_itself(given_callable(kind(**RANGE)))
-        arm.network(torch.ones(1, 2), torch.ones(1, 2))
+        asked()
 
 
 def test_what_a_callable_states_becomes_the_model():
@@ -313,7 +315,7 @@ def short():
 )
 def test_a_prior_mean_that_cannot_be_is_one_line(short, change, message):
     with pytest.raises(InputError, match=message):
-        fit(short, None, SPEC, FitConfig(hidden=(2,), epochs=1, **change))
+        fit(short, None, SPEC, FitConfig(epochs=1, **change))
 
 
 def test_recordings_that_cannot_be_fitted_are_one_line(short):

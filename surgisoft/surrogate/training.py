@@ -49,27 +49,45 @@ class Rows:
 
 
 def hold_out(history: History, seed: int) -> Tensor:
-    """(R, T) mask of held-out rows: a fifth of the runs, or of long blocks where runs are few."""
+    """(R, T) mask of held-out rows: a fifth of the runs, or of long blocks where runs are few.
+
+    Runs without a measured key point are not held out, since they could validate nothing; blocks
+    are cut from the measured rows where the key points of a recording have long gaps.
+    """
     generator = torch.Generator().manual_seed(seed)
     held = torch.zeros_like(history.valid)
-    if history.runs >= RUNS:
-        order = torch.randperm(history.runs, generator=generator)
-        held[order[: max(1, round(0.2 * history.runs))]] = True
+    measured = history.valid & _seen(history)
+    dealt_runs = measured.any(1).nonzero()[:, 0]
+    if len(dealt_runs) >= RUNS:
+        order = dealt_runs[torch.randperm(len(dealt_runs), generator=generator)]
+        held[order[: max(1, round(0.2 * len(dealt_runs)))]] = True
         return held & history.valid
-    for run in range(history.runs):
-        length = int(history.valid[run].sum())
-        edges = torch.linspace(0, length, HOLD_BLOCKS + 1).round().long()
+    for rows in (history.valid, measured):
+        held = _held_blocks(rows, dealt_runs.tolist(), generator)
+        if (held & measured).any() and (~held & measured).any():
+            break
+    return held
+
+
+def _held_blocks(rows: Tensor, runs: list[int], generator: torch.Generator) -> Tensor:
+    """(R, T) mask of a fifth of the blocks of equal length into which rows (R, T) of runs are
+    cut."""
+    held = torch.zeros_like(rows)
+    for run in runs:
+        own = rows[run].nonzero()[:, 0]
+        edges = torch.linspace(0, len(own), HOLD_BLOCKS + 1).round().long()
         for block in torch.randperm(HOLD_BLOCKS, generator=generator)[: HOLD_BLOCKS // 5].tolist():
-            held[run, edges[block] : edges[block + 1]] = True
+            held[run, own[edges[block] : edges[block + 1]]] = True
     return held
 
 
 def dealt(history: History) -> Tensor:
     """(S,) number of the run of each row, or of its block of time where runs are few.
 
-    Such groups are held out together; runs are few below `RUNS`, as in `hold_out`.
+    Such groups are held out together; runs with measured rows are few below `RUNS`, as in
+    `hold_out`.
     """
-    if history.runs >= RUNS:
+    if int((history.valid & _seen(history)).any(1).sum()) >= RUNS:
         return history.run_of_row
     count = history.valid.sum(1, keepdim=True).clamp(min=1)
     along = torch.arange(history.valid.shape[1]) * HOLD_BLOCKS // count
@@ -77,9 +95,14 @@ def dealt(history: History) -> Tensor:
     return history.rows(runs * HOLD_BLOCKS + along)
 
 
+def _seen(history: History) -> Tensor:
+    """(R, T) rows, padding included, in which at least one key point was measured."""
+    return (~history.key_points.isnan()).all(-1).any(-1)
+
+
 def measured_rows(history: History) -> Tensor:
     """(S,) rows, without padding, in which at least one key point was measured."""
-    return history.rows((~history.key_points.isnan()).all(-1).any(-1))
+    return history.rows(_seen(history))
 
 
 @dataclass(frozen=True)

@@ -167,6 +167,34 @@ def test_a_fifth_of_the_runs_is_held_out_or_a_fifth_of_each_of_few():
                               for i in range(20 * rows)]  # fmt: skip
 
 
+def unmeasured(history, *places):
+    """The history without key points in (run, rows) places."""
+    points = history.key_points.clone()
+    for run, rows in places:
+        points[run, rows] = torch.nan
+    return replace(history, key_points=points)
+
+
+def test_only_runs_and_blocks_with_key_points_are_held_out():
+    """The held-out run of five without key points; four blocks of the measured rows of one."""
+    ten, every = still_runs(*range(20, 30)), slice(None)
+    for run in hold_out(ten, 0).any(1).nonzero()[:, 0].tolist():
+        lost = unmeasured(ten, (run, every))
+        held = hold_out(lost, 0)
+        assert not held[run].any()
+        assert held.any(1).sum() == 2
+    five = still_runs(100, 100, 100, 100, 100)
+    lost = unmeasured(five, (2, every))
+    held = hold_out(lost, 0)
+    assert held.sum(1).tolist() == [20, 20, 0, 20, 20], "blocks of the four that have key points"
+    assert dealt(lost).tolist() == [i // 5 for i in range(500)]
+    one = still_runs(400)
+    short = unmeasured(one, (0, hold_out(one, 0)[0]), (0, slice(0, 100)))
+    measured = (~short.key_points.isnan()).all(-1).any(-1)
+    held = hold_out(short, 0)
+    assert 0.15 < (held & measured).sum() / measured.sum() < 0.25
+
+
 def test_the_validated_error_counts_every_measured_key_point_once():
     """Distances of 1, 1, 1 mm of one key point and of 3 mm of one that was seen once."""
     target = torch.zeros(3, 2, 3)

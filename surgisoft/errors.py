@@ -1,11 +1,15 @@
 """`InputError`, the one error type for bad input from outside: files, options, names; warnings."""
 
 import difflib
+import traceback
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 LONGEST = 1000
 """Characters of a message; of a longer one the middle is left out."""
+SHOWN = 160
+"""Most characters of a foreign exception's text in a message."""
 
 
 class InputError(ValueError):
@@ -47,6 +51,20 @@ def one_line(text: str) -> str:
     if len(line) <= LONGEST:
         return line
     return f"{line[: LONGEST * 7 // 10]} ... {line[len(line) - LONGEST // 5 :]}"
+
+
+def raised_by(name: str, error: BaseException, thing: str = "model", file: str = "") -> InputError:
+    """The InputError for an exception in foreign code, with the line that raised it.
+
+    thing: what the user has to correct; file: the last line in this file is stated, not the last
+    one in a library that it calls.
+    """
+    frames = list(traceback.extract_tb(error.__traceback__))
+    where = [frame for frame in frames if frame.filename == file] or frames
+    place = f" in {Path(where[-1].filename).name} line {where[-1].lineno}" if where else ""
+    return InputError(
+        f"{name}: raised {type(error).__name__}{place}: {str(error)[:SHOWN]}; correct the {thing}"
+    )
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> InputError:

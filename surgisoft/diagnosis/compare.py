@@ -257,7 +257,7 @@ def compare(
     of its fit, so that the error is a test error.
     """
     model, recordings, before = open_model(model, recordings, before, predictions, error_mm)
-    model, recordings, notes = open_inputs(model, recordings, sized=False)
+    model, recordings, notes = open_inputs(model, recordings, sized=False, tried=False)
     if test:
         refuse_rows_of_fit(model, recordings)
     wrong = find_setup_faults(model, recordings) if part == "all" else None
@@ -404,7 +404,7 @@ def tables_of(
     for name, model in models.items():
         own = None if isinstance(model, ArmModel) else error_mm
         opened, given, _ = open_model(model, recordings, None, None, own)
-        opened, given, _ = open_inputs(opened, given, sized=False)
+        opened, given, _ = open_inputs(opened, given, sized=False, tried=False)
         found[name] = residual_table(opened, given)
     return found
 

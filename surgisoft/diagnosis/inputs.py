@@ -17,6 +17,7 @@ from surgisoft.measurement.histories import (
 )
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.surrogate.checkpoint import load_model
+from surgisoft.surrogate.effects import check_user_effects
 from surgisoft.surrogate.fitted_rows import Seen
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.training_residuals import TrainingResiduals
@@ -32,6 +33,7 @@ def open_inputs(
     recordings: Recordings,
     sized: bool = True,
     compared: bool = False,
+    tried: bool = True,
 ) -> tuple[ArmModel, list[Recording], tuple[str, ...]]:
     """The model and the recordings as a diagnosis takes them, with notes for its reader.
 
@@ -39,11 +41,14 @@ def open_inputs(
     direction (`under_weight`); the notes say so, and say where the recordings leave the range or
     the speed of the actuation that the model was fitted to. sized: whether the size of the arm has
     to fit, too; compared: whether they are compared with recordings from before a change, so that
-    what the model lacked before does not count.
+    what the model lacked before does not count; tried: whether effects are to be tried on the arm.
+    Those of named files are checked on it then, and whatever fails is an InputError.
     """
     arm = load_model(model)
     measured = load_recordings(recordings)
     check_fits(arm.spec, measured, sized)
+    if tried:
+        check_user_effects(arm.facts, tried=True)
     turned, notes = under_weight(arm, measured)
     taken_part = part_in_fit(arm, measured)
     beyond = outside_range(arm.spec, measured)

@@ -25,13 +25,20 @@ from surgisoft.config import describe
 from surgisoft.errors import InputError, Interrupted, unknown_name
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.chain import Taps
-from surgisoft.surrogate.effects import FRONT, free_name, hypothesis_of, known_effects, make_effect
+from surgisoft.surrogate.effects import (
+    FRONT,
+    check_user_effects,
+    free_name,
+    hypothesis_of,
+    known_effects,
+    make_effect,
+)
 from surgisoft.surrogate.ensemble import train_ensemble
 from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.interval import ErrorInterval, calibrate, coverage_of, distance_to
 from surgisoft.surrogate.kernel_fit import KernelFit, fit_kernel
-from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.model import ArmModel, arm_facts
 from surgisoft.surrogate.networks import (
     HIDDEN,
     ConstantCurvature,
@@ -406,6 +413,10 @@ def fit(
     _check(train, valid, spec, config)
     start = time.perf_counter()
     torch.manual_seed(config.seed)
+    used = [name for name in config.effects if name != AUTO]
+    if AUTO in config.effects:
+        used += [name for name, kind in known_effects().items() if hypothesis_of(kind).memory]
+    check_user_effects(arm_facts(spec, rest_shape(train)), used)
     data = Data.split(train, valid, config.seed)
     low, high, band = (torch.tensor(x) for x in (spec.low, spec.high, spec.band))
     # Each stage puts its model here.

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, raised_by
 from surgisoft.surrogate.arm import ArmSpec
-from surgisoft.surrogate.callables.named import Named, checked_points, raised_by, stated
+from surgisoft.surrogate.callables.named import Named, checked_points, stated
 from surgisoft.surrogate.callables.network import CallableNetwork, form_of
 from surgisoft.surrogate.model import ArmModel, Validation
 

@@ -15,11 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, raised_by
 from surgisoft.numpy_code import HELPERS, Constants, numpy_function
 from surgisoft.surrogate.callables import arm_runner, portable
 from surgisoft.surrogate.callables.called import CALLED
-from surgisoft.surrogate.callables.named import raised_by
 from surgisoft.surrogate.callables.network import CallableNetwork
 from surgisoft.surrogate.callables.operators import as_operators
 

@@ -9,7 +9,6 @@ import hashlib
 import importlib
 import importlib.util
 import sys
-import traceback
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import entry_points
@@ -19,13 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from surgisoft.errors import InputError
+from surgisoft.errors import SHOWN, InputError, raised_by
 from surgisoft.files import resolved
 
 GROUP = "surgisoft.models"
 """Entry point group of callable models in installed packages."""
-SHOWN = 160
-"""Most characters of a foreign exception's text in a message."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,15 +168,6 @@ def name_callables(names: Iterable[str]) -> None:
 def named_callables() -> list[str]:
     """Names of the callables that were imported by name: a new process has to do the same."""
     return list(NAMED)
-
-
-def raised_by(name: str, error: BaseException) -> InputError:
-    """The InputError for an exception in foreign code, with the line that raised it."""
-    where = traceback.extract_tb(error.__traceback__)
-    place = f" in {Path(where[-1].filename).name} line {where[-1].lineno}" if where else ""
-    return InputError(
-        f"{name}: raised {type(error).__name__}{place}: {str(error)[:SHOWN]}; correct the model"
-    )
 
 
 def as_numbers(value: Any) -> np.ndarray:

@@ -15,14 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, raised_by
 from surgisoft.surrogate.callables import operators
 from surgisoft.surrogate.callables.named import (
     Named,
     as_numbers,
     checked_points,
     no_graph,
-    raised_by,
     read_attribute,
     stored_callable,
 )

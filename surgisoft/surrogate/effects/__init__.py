@@ -16,6 +16,7 @@ from surgisoft.surrogate.effects.base import (
     Quantity,
     Stage,
 )
+from surgisoft.surrogate.effects.check import check_effect
 from surgisoft.surrogate.effects.contact import Contact
 from surgisoft.surrogate.effects.coupling import Coupling
 from surgisoft.surrogate.effects.creep import Creep
@@ -65,6 +66,8 @@ __all__ = [
     "Quantity",
     "Reading",
     "Stage",
+    "check_effect",
+    "check_user_effects",
     "effect_class",
     "free_name",
     "hypothesis_of",
@@ -158,6 +161,22 @@ def effect_class(name: str) -> type[Effect]:
 def make_effect(name: str, facts: ArmFacts, **config) -> Effect:
     """The named effect for an arm; `config` are the arguments of its class."""
     return effect_class(name)(facts, **config)
+
+
+def check_user_effects(
+    facts: ArmFacts, names: Iterable[str] | None = None, tried: bool = False
+) -> None:
+    """Try the user-defined effects among some on an arm; whatever fails is an InputError.
+
+    names: of effects; None: those of all files that were named. tried: as identification tries
+    them.
+    """
+    for name in list(user_defined.FILES) if names is None else names:
+        if name in EFFECTS:
+            continue
+        file = user_defined.FILES.get(name)
+        label = f"effect '{name}'" if file is None else file.path
+        check_effect(effect_class(name), facts, label, "" if file is None else file.path, tried)
 
 
 def free_name(kind: str, taken: Iterable[str]) -> str:

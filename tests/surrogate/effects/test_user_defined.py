@@ -8,11 +8,18 @@ from pathlib import Path
 import pytest
 import torch
 
+from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.errors import InputError
+from surgisoft.measurement.fitting import fit
+from surgisoft.measurement.protocols import make_protocol
+from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.arm import ArmSpec
-from surgisoft.surrogate.checkpoint import load_model, save_model
+from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
 from surgisoft.surrogate.effects import (
+    EFFECTS,
     Context,
+    check_effect,
+    check_user_effects,
     hypothesis_of,
     known_effects,
     make_effect,
@@ -240,6 +247,58 @@ def test_two_files_of_one_name_are_refused(slack, tmp_path):
     assert not user_defined.FILES
     register_effect_files([slack, other.parent / ".." / "slack.py"])
     assert user_defined.FILES["slack"].path == str(slack)
+
+
+WRONG = [
+    ("self.loss *", "self.los *", r": raised AttributeError in slack.py line \d+: .*'los'"),
+    (
+        "(signal - self.origin)",
+        "(signal - self.origin)[..., :1].expand(9, 9, 9)",
+        ": raised Runtim",
+    ),
+    ("return signal -", "return 0.9 * signal -", ": it changes the signal at zero amplitude"),
+    ("return signal -", "return signal[..., :2] * 1 -", ": raised RuntimeError|'apply' returned"),
+    (".clamp(max=0)", ".log()", r": '(apply|sensitivities)' returned values that are not finite"),
+    ('{"loss": self.loss}', "{}", ": 'amplitudes' returned {}, expected at least one parameter"),
+    ("return {}", 'return {"a": 1}', r": raised TypeError in \S+ line \d+: .*'a'"),
+    ("self.loss.detach()", "self.lost.detach()", r": raised AttributeError in slack.py line \d+"),
+    ("torch.zeros(1)", "torch.zeros(facts.rooms)", r": raised AttributeError in slack.py line \d+"),
+]
+"""What replaces what in the documentation's effect, and what is said of it."""
+
+
+@pytest.mark.parametrize(("old", "new", "message"), WRONG, ids=[each[1] for each in WRONG])
+def test_what_an_effect_does_wrong_is_told_before_it_is_used(slack, old, new, message):
+    register_effect_file(slack)
+    check_user_effects(FACTS)
+    check_user_effects(FACTS, ["slack"])
+    assert old in EXAMPLE
+    slack.write_text(EXAMPLE.replace(old, new))
+    register_effect_file(slack)
+    for tried in (False, True):
+        with pytest.raises(InputError, match=message) as error:
+            check_user_effects(FACTS, tried=tried)
+        assert str(error.value).startswith(f"{slack}: ")
+        assert str(error.value).endswith("; correct the effect")
+    check_user_effects(FACTS, ["creep"])
+
+
+def test_a_fit_and_a_diagnosis_check_an_effect_before_the_work(slack, tmp_path):
+    """No epoch of the fit is done, and no output folder is made."""
+    slack.write_text(EXAMPLE.replace("return signal -", "return 0.9 * signal -"))
+    recording = VirtualRig(0).record(make_protocol("ramps", VirtualRig(0).limits, 90, seed=2))[0]
+    stages = []
+    with pytest.raises(InputError, match="it changes the signal at zero amplitude"):
+        fit(recording, effects=[str(slack)], progress=lambda *told: stages.append(told))
+    assert not stages
+    with pytest.raises(InputError, match="it changes the signal at zero amplitude"):
+        diagnose(default_arm(), recording)
+
+
+def test_every_effect_of_the_package_passes_the_check_of_users_effects():
+    for name, kind in EFFECTS.items():
+        for tried in (False, True):
+            check_effect(kind, FACTS, name, tried=tried)
 
 
 def test_a_missing_file_is_refused():

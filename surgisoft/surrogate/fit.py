@@ -67,6 +67,9 @@ from surgisoft.surrogate.training import (
 from surgisoft.surrogate.training import train as train_model
 from surgisoft.surrogate.training_residuals import ROWS, TrainingResiduals
 
+UNPROVED = 0.5
+"""Share of the squared held-out error of the finished stages below which the model of an interrupted
+stage is kept."""
 NEIGHBOURS = 24
 """Rows of nearby pressure that are compared with each row."""
 LEAST_CONTRAST = 0.15
@@ -305,6 +308,9 @@ class Interruption:
     """Whether the model is the best one of that training; else it is that of `finished`."""
     finished: tuple[str, ...]
     """Stages that were finished and accepted before."""
+    unproved: str = ""
+    """Stage whose model is kept because it errs less, though it was not compared with the simpler
+    model trained for as long; empty: none."""
 
     @property
     def sentence(self) -> str:
@@ -313,6 +319,8 @@ class Interruption:
         model = "the best one so far"
         if not self.used:
             model = f"that of the finished stages: {', '.join(self.finished)}"
+            if self.unproved:
+                model += f", with {self.unproved}, which lowers their held-out error"
         return f"the fit was interrupted in '{self.stage}'{after}; the model is {model}"
 
 
@@ -492,9 +500,10 @@ def _validated_epoch(result: FitResult) -> int:
 def _take_interrupted(data: Data, result: FitResult, seconds: float) -> None:
     """Validate the model of an interrupted fit, and note where it was interrupted."""
     model, stage = result.model, result.running[0]
-    finished = tuple(each.name for each in result.stages if each.kept)
+    finished = tuple(each.name for each in result.stages if each.kept and not each.reason)
+    unproved = "".join(each.name for each in result.stages if each.reason == "interrupted")
     used, epoch = not finished, _validated_epoch(result)
-    result.interrupted = Interruption(stage, epoch, used, finished)
+    result.interrupted = Interruption(stage, epoch, used, finished, unproved)
     if isinstance(model.network, KernelArm):  # validated by its own cross-validation
         return
     model.rest_mm.copy_(rest_shape(data.train))
@@ -818,13 +827,19 @@ def _stage(
     except KeyboardInterrupt:
         if result.model is None and _validated_epoch(result):
             result.model = candidate
+        elif result.model is not None:
+            _keep_better(candidate, name, _validated_epoch(result), begin, data, result)
         raise
     after = _square(candidate, data)
     kept, reason, simpler_rmse = True, "", None
     if result.model is not None:
         simpler = copy.deepcopy(result.model)
         _begin(result, f"without {name}")
-        train_model(simpler, data, f"without {name}", epochs, config, result.loss, progress)
+        try:
+            train_model(simpler, data, f"without {name}", epochs, config, result.loss, progress)
+        except KeyboardInterrupt:
+            _keep_better(candidate, name, done, begin, data, result)
+            raise
         before = _square(simpler, data)
         simpler_rmse = _rmse(before)
         kept, reason = _better(before, after, data.validation_rows(simpler).block)
@@ -837,6 +852,21 @@ def _stage(
     rmse = _rmse(after)
     seconds = time.perf_counter() - begin
     result.stages.append(StageReport(name, rmse, done, seconds, kept, reason, simpler_rmse))
+
+
+def _keep_better(
+    candidate, name: str, epochs: int, begin: float, data: Data, result: FitResult
+) -> None:
+    """Keep the model of an interrupted stage where it errs significantly less than that of the
+    finished stages, by more than `UNPROVED`: it was not compared with the simpler model trained for
+    as long."""
+    before, after = _square(result.model, data), _square(candidate, data)
+    better, _ = _better(UNPROVED * before, after, data.validation_rows(candidate).block)
+    if epochs and better:
+        result.model = candidate
+        seconds = time.perf_counter() - begin
+        report = StageReport(name, _rmse(after), epochs, seconds, True, "interrupted")
+        result.stages.append(report)
 
 
 def _add_memory(data: Data, spec, config, support: _Support, result: FitResult, progress) -> None:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy import stats
 
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, Interrupted
 from surgisoft.surrogate import ensemble
 from surgisoft.surrogate.effects import hypothesis_of
 from surgisoft.surrogate.effects.twist import Twist
@@ -382,6 +382,31 @@ def test_a_lag_of_the_line_is_fitted_through_whole_runs():
     assert found["share"] == pytest.approx(1.0, abs=0.1)
     assert found["tau_up_s"] == pytest.approx(0.4, rel=0.4)
     assert found["tau_down_s"] == pytest.approx(1.2, rel=0.4)
+
+
+@pytest.mark.parametrize("running", ["line_lag", "without line_lag"])
+def test_ctrl_c_keeps_an_effect_that_lowers_the_held_out_error(running):
+    """In its own stage, or in that of the simpler model, which was not trained as long then."""
+    runs = [lagging(300, seed) for seed in range(8)]
+    train, valid = (
+        pack(*([run[k] for run in part] for k in range(3))) for part in (runs[:6], runs[6:])
+    )
+    config = replace(SMALL, hidden=(24, 24), epochs=40, learning_rate=1e-2, effects=("line_lag",))
+
+    def press(stage, epoch, epochs, best):
+        if stage == running and epoch >= 0.7 * epochs:
+            raise KeyboardInterrupt
+
+    with pytest.raises(Interrupted) as ended:
+        fit(train, valid, SPEC, config, press)
+    result = ended.value.result
+    where, (first, second) = result.interrupted, result.stages
+    assert (where.stage, where.finished, where.unproved) == (running, ("pressure",), "line_lag")
+    assert where.sentence.endswith("pressure, with line_lag, which lowers their held-out error")
+    assert list(result.model.effects) == ["line_lag"]
+    assert (first.reason, second.reason) == ("", "interrupted")
+    assert second.valid_rmse_mm < 0.5 * first.valid_rmse_mm
+    assert result.model.validation.rmse_mm == pytest.approx(second.valid_rmse_mm)
 
 
 def test_effects_behind_the_network_are_left_to_amend(walks):

@@ -68,8 +68,8 @@ from surgisoft.surrogate.training import train as train_model
 from surgisoft.surrogate.training_residuals import ROWS, TrainingResiduals
 
 UNPROVED = 0.5
-"""Share of the squared held-out error of the finished stages below which the model of an interrupted
-stage is kept."""
+"""Share of the squared held-out error of the finished stages below which the model of a stage that
+was interrupted is kept."""
 NEIGHBOURS = 24
 """Rows of nearby pressure that are compared with each row."""
 LEAST_CONTRAST = 0.15

@@ -16,6 +16,9 @@ from surgisoft.files import resolved
 if TYPE_CHECKING:
     from surgisoft.surrogate.model import ArmModel
 
+MEANING = {"measured": "the actuation", "key_points": "key points"}
+"""What the required tables of a map hold, for messages."""
+
 
 @app.command("import")
 def import_(
@@ -45,8 +48,8 @@ def import_(
         Path | None,
         typer.Option(
             metavar="NEW.toml",
-            help="Only write a draft of the map, from the names of a file's columns; check it "
-            "before you use it.",
+            help="Only write a draft of the map, from the names of the columns of one file, or of "
+            "the files of one recording; check it before you use it.",
         ),
     ] = None,
     force: Force = False,
@@ -141,25 +144,34 @@ def _check_kept(read: list[Path], targets: list[Path]) -> None:
 
 
 def _draft(raw: list[Path], place: Path, force: bool) -> None:
-    """Write a draft of the map of a raw file."""
+    """Write a draft of the map of a raw file, or of the files of one recording."""
     from surgisoft.files import write_atomically
-    from surgisoft.measurement.importing import draft_map
+    from surgisoft.measurement.importing import draft_of_map
 
-    if len(raw) != 1:
-        raise InputError(f"--draft: got {len(raw)} raw files, expected one of them")
-    if raw[0].is_dir():
-        inside = sorted(path for path in raw[0].iterdir() if path.is_file())
-        such = f", such as {inside[0]}" if inside else ""
-        raise InputError(f"--draft: {raw[0]} is a folder, expected one file of it{such}")
+    for path in raw:
+        if path.is_dir():
+            inside = sorted(file for file in path.iterdir() if file.is_file())
+            such = f", such as {inside[0]}" if inside else ""
+            raise InputError(f"--draft: {path} is a folder, expected one file of it{such}")
     if place.suffix != ".toml":
         raise InputError(f"{place}: suffix '{place.suffix}', expected .toml")
     if place.exists() and not force:
         raise InputError(f"{place}: exists already; choose another name or use --force")
-    text = draft_map(raw[0])
-    write_atomically(place, text)
-    checks = text.count("# check:")
-    print(f"wrote {place}: a draft; check every line, above all the {checks} marked 'check'")
-    print(f"next: surgisoft import {typed(raw[0])} --map {typed(place)} -o REC.parquet --dry-run")
+    drafted = draft_of_map(raw)
+    write_atomically(place, drafted.text)
+    print(
+        f"wrote {place}: a draft; check every line, above all the {drafted.checks} marked 'check'"
+    )
+    for table in drafted.lacks:
+        print(
+            f"lacks [{table}]: no columns of {MEANING[table]} are recognised; fill in this table "
+            f"first, or add the file that has them: surgisoft import {typed(*raw)} OTHER --draft "
+            f"{typed(place)} --force"
+        )
+    following = "then" if drafted.lacks else "next"
+    print(
+        f"{following}: surgisoft import {typed(*raw)} --map {typed(place)} -o REC.parquet --dry-run"
+    )
 
 
 def _test_setup(arm: "ArmModel", name: str, recordings: list) -> None:

@@ -494,7 +494,7 @@ REFUSED = {
     "import {dir}/full.csv": "-o is missing: a new recording (.csv, .parquet) or a folder",
     "import {dir}/full.csv -o {dir}/a.csv": "--map is missing: a map file states columns",
     "import {dir}/full.csv -o {dir}/a.xlsx": "suffix '.xlsx', expected .csv, .parquet or a folder",
-    "import {dir}/full.csv {rec} --draft {dir}/m.toml": "got 2 raw files, expected one of them",
+    "import {rec} {rec} --draft {dir}/m.toml": "files of one name, which a map cannot tell apart",
     "import {dir} --draft {dir}/m.toml": "folder, expected one file of it, such as {dir}/a.stl",
     "import {dir}/folder.rrd --draft {dir}/m.toml": "is a folder, expected one file of it",
     "import {dir}/full.csv --draft {dir}/m.txt": "suffix '.txt', expected .toml",

@@ -6,7 +6,7 @@ from scipy.io import savemat
 
 from surgisoft.cli import run
 from surgisoft.errors import InputError
-from surgisoft.measurement.importing import draft_map, import_files, load_map
+from surgisoft.measurement.importing import draft_map, draft_of_map, import_files, load_map
 
 ROWS = [[0, 1.5, 2.5, 0, 0, 1, 0.5, 0, 60], [50, 1.75, 2.25, 0, 0, 1, 0.25, 0, 61]] * 6
 """ms, two pressures, two points."""
@@ -145,6 +145,116 @@ def test_of_equal_groups_the_draft_takes_the_first(tmp_path):
     assert found.unit == "bar"
     np.testing.assert_allclose(found.measured, rows[:, 1:3])
     np.testing.assert_allclose(found.key_points_mm[:, 0], 1000 * rows[:, 3:6])
+
+
+def two_logs(folder, air="lab_air.csv", camera="lab_cam.csv"):
+    """An air log of 100 Hz whose pressures grow by 10 and 20 a second, and a camera of 20 Hz; the
+    clock shows 7 s at the start."""
+    rows = [f"{7 + k / 100:.2f},{k / 10:g},{k / 5:g},{k / 10:g},{k / 5:g}" for k in range(101)]
+    header = "stamp,setA,setB,regA,regB"
+    (folder / air).write_text("\n".join([header, *rows]) + "\n")
+    rows = [f"{k},{7 + k / 20:.2f},1,2,{50 + k}" for k in range(20)]
+    (folder / camera).write_text("\n".join(["frame,clock,D0x,D0y,D0z", *rows]) + "\n")
+    return [folder / air, folder / camera]
+
+
+@pytest.mark.parametrize(
+    ("names", "patterns"),
+    [
+        (("lab_air.csv", "lab_cam.csv"), ("*_air.csv", "*_cam.csv")),
+        (("air-03.csv", "cam-03.csv"), ("air-*.csv", "cam-*.csv")),
+        (("valves.csv", "camera.csv"), ("valves.csv", "camera.csv")),
+        (("a_cam.csv", "a_cam_cam.csv"), ("a_cam.csv", "a_cam_cam.csv")),
+    ],
+)
+def test_files_of_one_recording_are_drafted_together(tmp_path, names, patterns):
+    """The camera's rows are the samples, wherever it stands; at 0.05 s the pressures are 0.5, 1."""
+    files = two_logs(tmp_path, *names)
+    drafted = draft_of_map(files)
+    assert drafted.lacks == ()
+    (tmp_path / "map.toml").write_text(drafted.text)
+    spec = load_map(str(tmp_path / "map.toml"))
+    assert tuple(role.match for role in spec.file.values()) == patterns[::-1]
+    (part,) = import_files(files, spec, "lab")
+    steps = np.arange(20)
+    np.testing.assert_allclose(part.recording.t_s, 0.05 * steps, atol=1e-9)
+    expected = np.column_stack([0.5 * steps, 1.0 * steps])
+    np.testing.assert_allclose(part.recording.measured, expected, atol=1e-9)
+    np.testing.assert_allclose(part.recording.commanded, expected, atol=1e-9)
+    np.testing.assert_allclose(part.recording.key_points_mm[:, 0, 2], 50 + steps)
+
+
+def test_files_without_time_are_joined_by_rows_and_marked(tmp_path):
+    files = two_logs(tmp_path)
+    files[0].write_text("setA,setB,pA,pB\n" + "\n".join(["1,2,3,4"] * 20) + "\n")
+    text = draft_map(files)
+    assert 'join = "rows"  # check: no column of time is recognised' in text
+    assert '[measured]\nfile = "air"\ncolumns = ["pA", "pB"]' in text
+
+
+@pytest.mark.parametrize(
+    ("header", "measured"),
+    [
+        ("set1,set2,reg1,reg2", '"reg1", "reg2"'),
+        ("A_set,B_set,A_is,B_is", '"A_is", "B_is"'),
+        ("set1,set2,reg1,flow2", '"set1", "set2"'),
+        ("set1,set2,reg1,reg2,flow1,flow2", '"set1", "set2"'),
+    ],
+)
+def test_columns_called_as_the_command_are_taken_for_its_measured_values(
+    tmp_path, header, measured
+):
+    """Only where all channels have such a column, and no second text fits as well."""
+    path = tmp_path / "lab.csv"
+    count = header.count(",") + 4
+    path.write_text(f"{header},x,y,z\n" + ",".join("1" * count) + "\n")
+    text = draft_map(path)
+    assert f"columns = [{measured}]" in text.split("[measured]")[1].split("[commanded]")[0]
+    assert ("called as the command's" in text) == ("set1" not in measured)
+
+
+def test_a_draft_of_one_of_two_files_says_what_it_lacks(tmp_path, monkeypatch, capsys):
+    """The line that comes next is not one that cannot succeed."""
+    two_logs(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    for raw, table in (("lab_air.csv", "key_points"), ("lab_cam.csv", "measured")):
+        assert run(["import", raw, "--draft", "map.toml", "--force"]) == 0
+        _, lacks, then = capsys.readouterr().out.splitlines()
+        assert lacks.startswith(f"lacks [{table}]: no columns of ")
+        assert f"surgisoft import {raw} OTHER --draft map.toml --force" in lacks
+        assert then.startswith(f"then: surgisoft import {raw} --map map.toml")
+        text = (tmp_path / "map.toml").read_text()
+        assert f"# [{table}]  # check: no columns" in text
+        assert "# import needs this table" in text
+    command = "import lab_air.csv lab_cam.csv --draft map.toml --force"
+    assert run(command.split()) == 0
+    following = capsys.readouterr().out.splitlines()[1].removeprefix("next: surgisoft ")
+    assert run(following.split()) == 0
+    assert "would write REC.parquet: continuous, 20 rows, 1 run, 2 channels" in (
+        capsys.readouterr().out
+    )
+    assert run(["import", "lab_air.csv", "lab_cam.csv", "-o", "rec.csv"]) == 2
+    assert "'surgisoft import lab_air.csv lab_cam.csv --draft" in capsys.readouterr().err
+
+
+def test_files_of_one_kind_or_one_name_are_not_drafted_together(tmp_path):
+    files = two_logs(tmp_path)
+    other = tmp_path / "other_cam.csv"
+    other.write_bytes(files[1].read_bytes())
+    with pytest.raises(InputError, match=r"the same columns, expected one file of each kind"):
+        draft_map([*files, other])
+    (tmp_path / "b").mkdir()
+    two_logs(tmp_path / "b", air="lab_cam.csv", camera="c.csv")
+    with pytest.raises(InputError, match=r"files of one name, .*; rename one of them"):
+        draft_map([files[1], tmp_path / "b" / "lab_cam.csv"])
+
+
+def test_a_list_of_columns_says_how_many_it_leaves_out(tmp_path):
+    path = tmp_path / "a.csv"
+    names = [f"n{k}" for k in range(13)]
+    path.write_text(",".join(names) + "\n" + ",".join("1" * 13) + "\n")
+    with pytest.raises(InputError, match=r"among n0, .*, n11 and 1 more, and none of an actuation"):
+        draft_map(path)
 
 
 def test_no_key_points_and_no_numbers_are_errors(tmp_path):

@@ -7,7 +7,7 @@ from surgisoft.measurement.importing.convert import (
     import_log,
     import_recordings,
 )
-from surgisoft.measurement.importing.draft import draft_map
+from surgisoft.measurement.importing.draft import MapDraft, draft_map, draft_of_map
 from surgisoft.measurement.importing.raw import RawTable, Reader
 from surgisoft.measurement.importing.readers import READERS
 from surgisoft.measurement.importing.ready_maps import READY_MAPS
@@ -18,9 +18,11 @@ __all__ = [
     "READY_MAPS",
     "ImportMap",
     "Imported",
+    "MapDraft",
     "RawTable",
     "Reader",
     "draft_map",
+    "draft_of_map",
     "import_files",
     "import_lerobot",
     "import_log",

@@ -58,6 +58,8 @@ from surgisoft.measurement.units import factor, unit_named
 
 COLUMN_LETTERS = {"measured": "p", "commanded": "c"}
 """First letter of the columns of an actuation that the map leaves to their names."""
+DRAFTED = 3
+"""Most raw files that are taken for those of one recording where a draft of a map is proposed."""
 _ENDINGS = (".gz", ".bz2", ".xz", ".csv", ".tsv", ".txt", ".dat", ".log", ".parquet")
 
 
@@ -107,10 +109,10 @@ def import_recordings(
         return _named_apart([import_log(path, name or path.stem) for path in paths])
     if paths and all(is_dataset(path) for path in paths):
         return _named_apart([import_lerobot(path, name or path.name) for path in paths])
-    first = f" {typed(paths[0])}" if paths else ""
+    shown = f" {typed(*paths[: DRAFTED if len(paths) <= DRAFTED else 1])}" if paths else ""
     raise InputError(
         "--map is missing: a map file states columns, units and frames; "
-        f"'surgisoft import{first} --draft map.toml' writes one to start from"
+        f"'surgisoft import{shown} --draft map.toml' writes one to start from"
     )
 
 

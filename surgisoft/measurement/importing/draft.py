@@ -1,10 +1,13 @@
-"""A draft of a map file from the names of a raw file's columns.
+"""A draft of a map file from the names of the columns of one raw file, or of several together.
 
 Of a text file the draft also has the separator and the decimal sign. What a name does not say (a
 unit, the frame) is marked for the person who checks the draft. Names of columns that another reader
 makes are paths, such as `run1.tip_cm.0` in a MATLAB or HDF5 file.
 """
 
+import fnmatch
+import glob
+import itertools
 import json
 import re
 from collections.abc import Callable, Iterable, Sequence
@@ -26,6 +29,8 @@ LOOKED_AT = 400
 LEAST_NUMBERS = 0.8
 """Least share of the cells of a row of numbers that are numbers or empty [-]; the others may be
 words, such as the name of a phase."""
+SHOWN = 12
+"""Most names of columns that a message lists (a count)."""
 NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?|nan|n/a|", re.I)
 """A cell of a row of numbers: a number, or one that is missing. The patterns below are of column
 names in English and German, and what they find is marked for checking."""
@@ -76,13 +81,122 @@ class _Layout:
         return A_PLACE.sub("", name).rpartition(".")[2] if self.paths else name
 
 
-def draft_map(path: str | Path) -> str:
-    """The text of a map for a raw file, to be checked by a person.
+@dataclass(frozen=True)
+class MapDraft:
+    """A draft of a map, and what it lacks."""
 
-    Raises InputError for a file that no reader reads, for one without rows of numbers, and where no
-    columns of key points are recognised.
+    text: str
+    """The map as TOML, to be checked by a person."""
+    lacks: tuple[str, ...]
+    """Required tables for which no columns are recognised: "measured", "key_points"."""
+
+    @property
+    def checks(self) -> int:
+        """Number of lines that are marked `check`."""
+        return self.text.count("# check:")
+
+
+@dataclass(frozen=True)
+class _Recognised:
+    """A raw file and what its columns are taken for; columns are counted from 0."""
+
+    path: Path
+    """The file."""
+    layout: _Layout
+    """Its layout."""
+    time: int | None
+    """Column of the time."""
+    points: list[tuple[int, int, int]]
+    """Columns x, y, z of each key point."""
+    measured: list[int]
+    """Columns of the measured actuation."""
+    commanded: list[int]
+    """Columns of the commanded actuation."""
+    by_command: bool
+    """Whether the measured columns are recognised only because they are called as the command's."""
+    runs: int | None
+    """Column in which a new value begins a new run."""
+
+    def named(self, columns: Sequence[int]) -> list[str]:
+        """The columns as TOML."""
+        return _columns(self.layout)(columns)
+
+    def labels(self, columns: Sequence[int]) -> list[str]:
+        """The parts of the columns' names that describe them."""
+        return [self.layout.label(self.layout.names[k]) for k in columns]
+
+
+def draft_map(path: str | Path | Sequence[str | Path]) -> str:
+    """The text of a map for raw files, to be checked by a person; see `draft_of_map`."""
+    return draft_of_map([path] if isinstance(path, str | Path) else path).text
+
+
+def draft_of_map(paths: Sequence[str | Path]) -> MapDraft:
+    """A draft of the map for one raw file, or for the files of one recording, joined by time.
+
+    The first file with key points becomes the main file. Raises InputError for a file that no
+    reader reads, for one without rows of numbers, where neither key points nor an actuation are
+    recognised, and for files that a map cannot tell apart or that are of one kind.
     """
-    path = Path(path)
+    found = [_recognised(Path(path)) for path in paths]
+    if not found:
+        raise InputError("no raw file given, expected at least one")
+    if not any(each.points or each.measured or each.commanded for each in found):
+        raise _nothing_recognised(found)
+    _check_kinds(found)
+    main = next((each for each in found if each.points), found[0])
+    files = [main, *(each for each in found if each is not main)]
+    patterns = _patterns([each.path for each in files])
+    roles = dict(zip(patterns, files, strict=True)) if len(files) > 1 else {"": main}
+    several = len(files) > 1
+    lines = [
+        f"# Draft of a map for {' and '.join(each.path.name for each in files)}, "
+        "from the names of the columns. Check every line:",
+        "# units, the order of the channels, the key points from base to tip, the frame.",
+        "# docs/recordings.md explains all fields.",
+        "",
+    ]
+    for role, each in roles.items():
+        joined = _joined_by(each, main) if each is not main else []
+        lines += _file(each.layout, role or "main", patterns[role] if several else "", joined)
+    lines += ["[time]"]
+    if main.time is None:
+        lines += ["rate_hz = 20.0  # check: no column of time is recognised", ""]
+    else:
+        unit = _unit(main.labels([main.time]), SECONDS_PER, "s")
+        lines += [f"column = {main.named([main.time])[0]}", f"unit = {unit}", ""]
+    sensed = _first(roles, lambda each: bool(each.measured) and not each.by_command)
+    sensed = sensed or _first(roles, lambda each: bool(each.measured))
+    wanted = _first(roles, lambda each: bool(each.commanded))
+    lines += _actuation(sensed, wanted, several)
+    if not sensed and not wanted:
+        lines += ["# [measured]  # check: no columns of the actuation are recognised;"]
+        lines += _to_add("columns = [...]  # a column per channel", 'unit = "kPa"')
+    lines += _key_points_table(main)
+    if main.runs is not None:
+        lines += [
+            "",
+            "[runs]  # check: a new value begins a new run",
+            f"column = {main.named([main.runs])[0]}",
+        ]
+    for role, each in roles.items():
+        used = {column for point in each.points for column in point} if each is main else set()
+        used |= {each.time, each.runs if each is main else None}
+        used |= {*each.measured} if sensed and sensed[0] == role else set()
+        used |= {*each.commanded} if wanted and wanted[0] == role else set()
+        unused = [name for k, name in enumerate(each.layout.names) if name and k not in used]
+        if unused:
+            of = f" of {each.path.name}" if several else ""
+            lines += ["", f"# not used{of}: {', '.join(unused)}"]
+    lacks = (
+        *(() if sensed or wanted else ("measured",)),
+        *(() if main.points else ("key_points",)),
+    )
+    return MapDraft("\n".join(lines) + "\n", lacks)
+
+
+def _recognised(path: Path) -> _Recognised:
+    """What the columns of a raw file are taken for."""
     try:
         layout = _layout(path) if chosen(path, FileRole()) is TEXT else _table_layout(path)
     except InputError as error:
@@ -92,12 +206,6 @@ def draft_map(path: str | Path) -> str:
         raise named from error
     names = layout.names
     points = [*_key_points(names), *(_key_point_arrays(layout) if layout.paths else [])]
-    if not points:
-        shown = ", ".join(name for name in names[:12] if name)
-        raise InputError(
-            f"{path}: no columns x, y, z of key points are recognised among {shown or 'unnamed'}; "
-            "write the map by hand, docs/recordings.md has one to start from"
-        )
     labels = [layout.label(name) for name in names]
     used = {column for point in points for column in point}
     time = next(
@@ -107,53 +215,182 @@ def draft_map(path: str | Path) -> str:
     rest = [k for k, name in enumerate(names) if name and k not in used]
     commanded = [k for k in rest if _is_command(labels[k])]
     measured = [k for k in rest if k not in commanded and _is_actuation(labels[k])]
-    lines = [
-        f"# Draft of a map for {path.name}, from the names of its columns. Check every line:",
-        "# units, the order of the channels, the key points from base to tip, the frame.",
-        "# docs/recordings.md explains all fields.",
-        "",
-        *_file(layout),
-        "[time]",
+    alike = [] if measured else _called_as(commanded, rest, labels)
+    runs = next((k for k in rest if RUN.fullmatch(labels[k]) and k not in commanded), None)
+    return _Recognised(path, layout, time, points, measured or alike, commanded, bool(alike), runs)
+
+
+def _called_as(commanded: Sequence[int], rest: Sequence[int], labels: Sequence[str]) -> list[int]:
+    """The columns that are called as the commanded ones but for one text, such as `reg` of `regA1`
+    and `regA2` for `set` of `setA1` and `setA2`; none where several texts or none fit."""
+    wanted = [labels[k] for k in commanded]
+    if len(wanted) < 2:
+        return []
+    before = len(_common_start(wanted))
+    after = len(_common_start([name[before:][::-1] for name in wanted]))
+    own = [name[before : len(name) - after] for name in wanted]
+    others = {labels[k]: k for k in rest if k not in commanded}
+    texts = {
+        (name[: match.start()], name[match.end() :])
+        for name in others
+        for match in re.finditer(re.escape(own[0]), name)
+    }
+    fit = [
+        [others[first + channel + last] for channel in own]
+        for first, last in sorted(texts)
+        if all(first + channel + last in others for channel in own)
     ]
-    column = _columns(layout)
-    if time is None:
-        lines += ["rate_hz = 20.0  # check: no column of time is recognised", ""]
-    else:
-        unit = _unit([labels[time]], SECONDS_PER, "s")
-        lines += [f"column = {column([time])[0]}", f"unit = {unit}", ""]
-    doubt = "" if commanded else "  # check: measured by sensors? Set values are [commanded]"
-    if commanded and not measured:
-        measured = commanded
+    return fit[0] if len(fit) == 1 and all(own) else []
+
+
+def _common_start(texts: Sequence[str]) -> str:
+    """The longest start that all texts have."""
+    pairs = zip(min(texts), max(texts), strict=False)
+    return "".join(a for a, _ in itertools.takewhile(lambda pair: pair[0] == pair[1], pairs))
+
+
+def _nothing_recognised(found: Sequence[_Recognised]) -> InputError:
+    """The error where the files show neither key points nor an actuation."""
+    names = [name for each in found for name in each.layout.names if name]
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    shown = f"{', '.join(names[:SHOWN])}{more}" if names else "unnamed columns"
+    advice = "write the map by hand, docs/recordings.md has one to start from"
+    if not names:
+        advice = (
+            "write the map by hand, with header = false in [file.NAME] and the columns by their "
+            "numbers, counted from 1; docs/recordings.md has one to start from"
+        )
+    places = ", ".join(str(each.path) for each in found)
+    return InputError(
+        f"{places}: no columns x, y, z of key points are recognised among {shown}, and none of an "
+        f"actuation; {advice}"
+    )
+
+
+def _check_kinds(found: Sequence[_Recognised]) -> None:
+    """Raise where two files are of one kind, or have one name."""
+    for first, second in itertools.combinations(found, 2):
+        if first.path.name == second.path.name:
+            raise InputError(
+                f"{first.path} and {second.path}: files of one name, which a map cannot tell "
+                "apart, expected names that differ; rename one of them"
+            )
+        if any(first.layout.names) and first.layout.names == second.layout.names:
+            raise InputError(
+                f"{first.path} and {second.path}: the same columns, expected one file of each "
+                "kind; draft the map from the files of one recording, it fits the others too"
+            )
+
+
+def _patterns(paths: Sequence[Path]) -> dict[str, str]:
+    """For each file a name of its table in the map, and the pattern of such files' names.
+
+    A start or an end that all names share up to a mark, such as `take7_` of `take7_air.csv` and
+    `take7_cam.csv`, is that of one recording: the pattern has `*` in its place.
+    """
+    stems = [path.name.partition(".")[0] or path.name for path in paths]
+    ends = [path.name[len(stem) :] for path, stem in zip(paths, stems, strict=True)]
+    start = re.match(r"(.*[_\-. ])?", _common_start(stems))
+    last = re.match(r"(.*[_\-. ])?", _common_start([stem[::-1] for stem in stems]))
+    before, after = (len(match[0]) if match else 0 for match in (start, last))
+    after = 0 if before else after
+    own = [stem[before : len(stem) - after] for stem in stems]
+    patterns = [
+        f"{'*' if before else ''}{stem[max(before - 1, 0) : len(stem) - max(after - 1, 0)]}"
+        f"{'*' if after else ''}{end}"
+        for stem, end in zip(stems, ends, strict=True)
+    ]
+    if any(
+        fnmatch.fnmatch(path.name, pattern) != (k == j)
+        for k, path in enumerate(paths)
+        for j, pattern in enumerate(patterns)
+    ):
+        patterns = [glob.escape(path.name) for path in paths]
+    roles = [re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_") for name in own]
+    if not all(roles) or len({*roles}) < len(roles):
+        roles = [f"file{k}" for k in range(1, len(paths) + 1)]
+    return dict(zip(roles, patterns, strict=True))
+
+
+def _first(
+    roles: dict[str, _Recognised], has: Callable[[_Recognised], bool]
+) -> tuple[str, _Recognised] | None:
+    """The first file that has something, with its name in the map."""
+    return next(((role, each) for role, each in roles.items() if has(each)), None)
+
+
+def _joined_by(file: _Recognised, main: _Recognised) -> list[str]:
+    """The fields by which the rows of a file belong to those of the main file."""
+    if file.time is None:
+        return [
+            'join = "rows"  # check: no column of time is recognised, so row i belongs to row i of '
+            f"{main.path.name}"
+        ]
+    lines = [
+        'join = "time"',
+        f"time = {file.named([file.time])[0]}",
+        f"time_unit = {_unit(file.labels([file.time]), SECONDS_PER, 's')}",
+    ]
+    if main.time is None:
+        return [
+            *lines,
+            f'clock = "from_start"  # check: {main.path.name} has no time; starts both files at 0',
+        ]
+    return [*lines, '# clock = "from_start"  # where the two clocks count from different moments']
+
+
+def _actuation(
+    sensed: tuple[str, _Recognised] | None, wanted: tuple[str, _Recognised] | None, several: bool
+) -> list[str]:
+    """The tables [measured] and [commanded]; sensed, wanted: the files that have their columns."""
+    doubt = "" if wanted else "  # check: measured by sensors? Set values are [commanded]"
+    if sensed and sensed[1].by_command:
+        doubt = "  # check: taken for the measured values because they are called as the command's"
+    if not sensed and wanted:
         doubt = "  # check: set values stand in, no sensor is here; fit with --actuation commanded"
-    for table, found in ((f"[measured]{doubt}", measured), ("[commanded]", commanded)):
-        if found:
-            unit = _unit([labels[k] for k in found], (*ACTUATION_UNITS, *MM_PER), "kPa")
-            lines += [table, f"columns = [{', '.join(column(found))}]", f"unit = {unit}"]
-            lines += ['# to = "kPa"  # the unit of your model, if it is another one', ""]
-    if not measured and not commanded:
-        lines += ["# [measured]  # check: no columns of the actuation are recognised", ""]
-    triples = ", ".join(f"[{', '.join(column(point))}]" for point in points)
-    lines += [
-        "[key_points]  # check: from base to tip",
-        f"positions = [{triples}]",
-        f"unit = {_unit([labels[k] for point in points for k in point], MM_PER, 'mm')}",
-        "",
+    lines = []
+    tables = (
+        (f"[measured]{doubt}", sensed or wanted, sensed is not None),
+        ("[commanded]", wanted, False),
+    )
+    for table, source, by_sensors in tables:
+        if source is None:
+            continue
+        role, file = source
+        columns = file.measured if by_sensors else file.commanded
+        unit = _unit(file.labels(columns), (*ACTUATION_UNITS, *MM_PER), "kPa")
+        lines += [table, *([f'file = "{role}"'] if several else [])]
+        lines += [f"columns = [{', '.join(file.named(columns))}]", f"unit = {unit}"]
+        lines += ['# to = "kPa"  # the unit of your model, if it is another one', ""]
+    return lines
+
+
+def _key_points_table(main: _Recognised) -> list[str]:
+    """The table [key_points], and the fields of [frame] as comments."""
+    triples = ", ".join(f"[{', '.join(main.named(point))}]" for point in main.points)
+    unit = _unit(main.labels([k for point in main.points for k in point]), MM_PER, "mm")
+    lines = ["[key_points]  # check: from base to tip", f"positions = [{triples}]"]
+    lines += [f"unit = {unit}", ""]
+    if not main.points:
+        lines = ["# [key_points]  # check: no columns x, y, z of key points are recognised;"]
+        example = '["x0", "y0", "z0"]' if main.layout.header else "[1, 2, 3]"
+        lines += _to_add(f"positions = [{example}, ...]  # base to tip", 'unit = "mm"')
+    return [
+        *lines,
         "# [frame]  # check: the recording's z points along the arm at rest, away from the base",
         '# rotation = "x z -y"  # our x is your x, our y your z, our z minus your y',
         '# origin = "k0"',
         "# gravity = [0, -1, 0]  # direction of weight in your frame",
     ]
-    runs = next((k for k in rest if RUN.fullmatch(labels[k]) and k not in commanded), None)
-    if runs is not None:
-        lines += [
-            "",
-            "[runs]  # check: a new value begins a new run",
-            f"column = {column([runs])[0]}",
-        ]
-    unused = [names[k] for k in rest if k not in (*measured, *commanded, runs)]
-    if unused:
-        lines += ["", f"# not used: {', '.join(unused)}"]
-    return "\n".join(lines) + "\n"
+
+
+def _to_add(*fields: str) -> list[str]:
+    """Lines of a required table that the files do not show, as comments to be filled in."""
+    return [
+        "# import needs this table: fill it in, or draft the map from all files of one recording",
+        *(f"# {field}" for field in fields),
+        "",
+    ]
 
 
 def _table_layout(path: Path) -> _Layout:
@@ -322,9 +559,12 @@ def _columns(layout: _Layout) -> Callable[[Sequence[int]], list[str]]:
     return columns
 
 
-def _file(layout: _Layout) -> list[str]:
-    """The table [file.main] where the layout is not the usual one."""
-    lines = []
+def _file(layout: _Layout, role: str, match: str, joined: Sequence[str]) -> list[str]:
+    """The table [file.ROLE], where the layout is not the usual one or the map has several files.
+
+    match: pattern of the names, empty where there is one file; joined: fields of the join.
+    """
+    lines = [f"match = {json.dumps(match, ensure_ascii=False)}"] if match else []
     if layout.topic:
         more = ", ".join(layout.groups[1:4]) + (", ..." if len(layout.groups) > 4 else "")
         lines.append(
@@ -340,4 +580,5 @@ def _file(layout: _Layout) -> list[str]:
     if not layout.header:
         named = ", ".join(f"{k} {name}" for k, name in enumerate(layout.names, 1) if name)
         lines.append(f"header = false{f'  # columns: {named}' if named else ''}")
-    return ["[file.main]", *lines, ""] if lines else []
+    lines += joined
+    return [f"[file.{role}]", *lines, ""] if lines else []

@@ -77,3 +77,114 @@ def test_usual_rows_steady_samples_and_jumping_rows_have_no_note_about_time():
     assert plausibility_notes(in_time(1e3, measured=jumping), "mm", "s") == []
     still = np.zeros_like(recording().measured)
     assert plausibility_notes(in_time(1e3, measured=still), "mm", "s") == []
+
+
+def driven(measured_by, shift_s: float = 0.0, seed: int = 0, **changes) -> Recording:
+    """Five minutes at 20 Hz of three chambers, each ramped to a new command every two seconds.
+
+    measured_by: a function from the commands (T, 3), late by `shift_s`, to the measured actuation.
+    """
+    rng = np.random.default_rng(seed)
+    t = 0.05 * np.arange(6000)
+    knots = rng.uniform(0.0, 20.0, (200, 3))
+
+    def commands(at):
+        return np.stack([np.interp(at, 2.0 * np.arange(200), k) for k in knots.T], axis=1)
+
+    points = np.zeros((len(t), 1, 3))
+    points[:, 0, 2] = 50.0
+    measured = measured_by(commands(t - shift_s)) + 0.05 * rng.standard_normal((len(t), 3))
+    return Recording(
+        name="arm",
+        t_s=t,
+        measured=measured,
+        key_points_mm=points,
+        commanded=changes.pop("commanded", commands(t)),
+        **changes,
+    )
+
+
+@pytest.mark.parametrize("shift_s", [0.0, 0.8, -0.4])
+@pytest.mark.parametrize(
+    ("order", "said"),
+    [
+        ([1, 0, 2], "channels 1 and 2 follow commanded channels 2 and 1 (correlation"),
+        ([1, 2, 0], "channels 1, 2 and 3 follow commanded channels 2, 3 and 1 (correlation"),
+    ],
+)
+def test_measured_channels_in_another_order_than_the_commands(order, said, shift_s):
+    """Measured column k holds command order[k]; the proposed order undoes that."""
+    swapped = driven(lambda command: command[:, order], shift_s)
+    (note,) = plausibility_notes(swapped, "mm", "s")
+    assert said in note
+    proposed = [
+        int(k) - 1 for k in note.partition("in the order [")[2].partition("]")[0].split(",")
+    ]
+    right = replace(swapped, measured=swapped.measured[:, proposed])
+    assert np.array_equal(np.array(order)[proposed], [0, 1, 2])
+    assert plausibility_notes(right, "mm", "s") == []
+
+
+def test_each_run_is_compared_on_its_own_clock():
+    """Times of every run begin at 0; row i of the second run is no row of the first."""
+    swapped = driven(lambda command: command[:, [1, 0, 2]], 0.4)
+    runs = np.repeat([0, 1, 2], 2000)
+    swapped = replace(swapped, run=runs, t_s=swapped.t_s - 100.0 * runs)
+    (note,) = plausibility_notes(swapped, "mm", "s")
+    assert "correlation 1.00 and 1.00" in note
+    assert "in the order [2, 1, 3]" in note
+
+
+def first_order_lag(command, time_constant_s):
+    """(T, m) commands at 20 Hz behind a lag of first order, computed step by step."""
+    lagging = command.copy()
+    for k in range(1, len(command)):
+        lagging[k] += np.exp(-0.05 / time_constant_s) * (lagging[k - 1] - command[k])
+    return lagging
+
+
+def with_channel(values, column):
+    """The values with another one in all rows of the first channel."""
+    changed = values.copy()
+    changed[:, 0] = column
+    return changed
+
+
+@pytest.mark.parametrize(
+    "measured_by",
+    [
+        lambda command: command,
+        lambda command: 6.9 * command + 3.0,
+        lambda command: first_order_lag(command, 4.0),
+        lambda command: np.minimum(command, 8.0),
+        lambda command: with_channel(command, 5.0),
+        lambda command: with_channel(command, command[:, 1]),
+        lambda command: np.zeros_like(command),
+    ],
+    ids=["exact", "scaled", "slow line", "clipped", "dead", "read twice", "no pressure"],
+)
+@pytest.mark.parametrize("seed", range(3))
+def test_lagging_clipped_and_dead_channels_are_in_their_order(measured_by, seed):
+    assert plausibility_notes(driven(measured_by, seed=seed), "mm", "s") == []
+
+
+def test_commands_that_are_alike_and_travelling_waves_are_in_their_order():
+    """Where channels share one command, or have it one after the other, a lag of a third of the
+    period makes each measured channel equal to another command; its own explains it as well."""
+    shared = driven(lambda command: command)
+    shared = replace(shared, commanded=np.repeat(shared.commanded[:, :1], 3, axis=1))
+    shared = replace(shared, measured=first_order_lag(shared.commanded, 0.5))
+    assert plausibility_notes(shared, "mm", "s") == []
+    for period_s in (1.0, 3.0):
+        phase = 2 * np.pi * (np.arange(6000)[:, None] * 0.05 / period_s - np.arange(3) / 3)
+        wave = replace(shared, commanded=np.sin(phase), measured=np.sin(phase - 2 * np.pi / 3))
+        assert plausibility_notes(wave, "mm", "s") == []
+
+
+def test_steady_state_samples_in_another_order_are_noted_too():
+    """Without rows that follow one another in time, no shift is tried."""
+    rng = np.random.default_rng(4)
+    steps = rng.uniform(0.0, 20.0, (6000, 3))
+    settled = driven(lambda _: steps[:, [0, 2, 1]], commanded=steps, kind="settled")
+    (note,) = plausibility_notes(settled, "mm")
+    assert "measured channels 2 and 3 follow commanded channels 3 and 2" in note

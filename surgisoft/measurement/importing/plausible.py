@@ -24,16 +24,95 @@ UNIT_TOLERANCE = 0.5
 """Largest difference, in the logarithm of the length, of a unit that is proposed."""
 BASE_MOTION = 3.0
 """Key points are taken for reversed where the first moves so many times more than the last."""
+LEAST_CORRELATION = 0.9
+"""A measured channel is said to follow another command only from this correlation on: one below it
+has lost too much to noise, clipping or a slow line to be assigned [-]."""
+LEAST_UNEXPLAINED = 0.1
+"""... and where its own command leaves at least this share of its variance unexplained [-] ..."""
+LEAST_RATIO_UNEXPLAINED = 4.0
+"""... which is so many times what the other command leaves: twice the error [-]."""
+SHIFT_S = 0.05
+"""Step of the delays between a command and its measured channel at which their correlation is
+taken; the largest one counts, so that a lag or clocks that differ are no wrong order [s]."""
+LARGEST_SHIFT_S = 3.0
+"""Largest such delay, either way [s]."""
+MOST_ROWS = 6000
+"""Rows, evenly over the recording, whose measured actuation is compared with the commands: they
+determine a correlation of 0.9 to within 0.01 (a count)."""
 
 
 def plausibility_notes(
     recording: Recording, unit: str | None, time_unit: str | None = None
 ) -> list[str]:
-    """Contradictions to the arm's stated length, the order base to tip and a moving arm's rows.
+    """Contradictions to the arm's stated length, the order base to tip, a moving arm's rows and the
+    order of the commanded channels.
 
     unit: of positions; time_unit: of the column of times, None where the map states a rate.
     """
-    return [*_length(recording, unit), *_order(recording), *_step(recording, time_unit)]
+    return [
+        *_length(recording, unit),
+        *_order(recording),
+        *_step(recording, time_unit),
+        *_channels(recording),
+    ]
+
+
+def _channels(recording: Recording) -> list[str]:
+    """A note where measured channels follow each other's commands and not their own."""
+    if recording.commanded is None or recording.chambers < 2:
+        return []
+    follows = _correlations(recording)
+    own = np.diagonal(follows)
+    best = follows.argmax(axis=1)
+    highest = follows.max(axis=1)
+    other = (
+        (best != np.arange(len(best)))
+        & (highest >= LEAST_CORRELATION)
+        & (1 - own**2 >= np.maximum(LEAST_RATIO_UNEXPLAINED * (1 - highest**2), LEAST_UNEXPLAINED))
+    )
+    moved = np.flatnonzero(other)
+    if not len(moved) or {*best[moved].tolist()} != {*moved.tolist()}:
+        return []
+    order = np.arange(len(best))
+    order[best[moved]] = moved
+    return [
+        f"measured channels {_listed(moved + 1)} follow commanded channels "
+        f"{_listed(best[moved] + 1)} (correlation {_listed(highest[moved], '.2f')}, with their own "
+        f"{_listed(own[moved], '.2f')}): if the columns of [measured] are in another order than "
+        f"those of [commanded], put them in the order {(order + 1).tolist()} in the map"
+    ]
+
+
+def _listed(values: np.ndarray, form: str = "d") -> str:
+    *first, last = (format(value, form) for value in values.tolist())
+    return f"{', '.join(first)} and {last}"
+
+
+def _correlations(recording: Recording) -> np.ndarray:
+    """(m, m) largest correlation of each measured channel (row) with each command (column), over
+    delays up to LARGEST_SHIFT_S either way; 0 where one of them is constant, and at least 0."""
+    commanded, measured = recording.commanded, recording.measured
+    assert commanded is not None, "only recordings with a command are compared"
+    steps = 0 if recording.kind == "settled" else round(LARGEST_SHIFT_S / SHIFT_S)
+    every = max(1, -(-len(measured) // MOST_ROWS))
+    clock, begin, end = _clock(recording)
+    asked, own, begin, end = (part[::every] for part in (clock, measured, begin, end))
+    found = np.zeros((recording.chambers, recording.chambers))
+    for shift in SHIFT_S * np.arange(-steps, steps + 1):
+        at = asked - shift
+        inside = (at >= begin) & (at <= end)
+        row = np.searchsorted(clock, at[inside] + 1e-9, side="right") - 1
+        both = np.concatenate([own[inside], commanded[row]], axis=1)
+        both = both[~np.isnan(both).any(axis=1)]
+        if len(both) < 2:
+            continue
+        from_mean = both - both.mean(axis=0)
+        size = np.sqrt(np.square(from_mean).sum(axis=0))
+        moves = size > 1e-9 * np.abs(both).max(axis=0) * np.sqrt(len(both))
+        unit = np.where(moves, from_mean / np.where(moves, size, 1.0), 0.0)
+        m = recording.chambers
+        found = np.maximum(found, unit[:, :m].T @ unit[:, m:])
+    return found
 
 
 def _step(recording: Recording, time_unit: str | None) -> list[str]:
@@ -95,3 +174,16 @@ def _order(recording: Recording) -> list[str]:
         f"key point k0 moves by {motion[0]:.3g} mm and the last one by {motion[-1]:.3g} mm (rms), "
         f"expected base to tip: if they are in reverse order, set order = {order} in [key_points]"
     ]
+
+
+def _clock(recording: Recording) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(T,) times [s] on a clock that increases from run to run, and the first and the last one of
+    each row's run."""
+    begin, end = np.empty((2, len(recording.t_s)))
+    shifted, at = np.empty(len(recording.t_s)), 0.0
+    for run in recording.runs:
+        t_s = recording.t_s[run]
+        shifted[run] = t_s - t_s[0] + at
+        begin[run], end[run] = at, shifted[run][-1]
+        at = float(shifted[run][-1]) + 1.0
+    return shifted, begin, end

@@ -249,6 +249,20 @@ def test_files_of_one_kind_or_one_name_are_not_drafted_together(tmp_path):
         draft_map([files[1], tmp_path / "b" / "lab_cam.csv"])
 
 
+def test_a_draft_of_a_file_without_header_says_what_the_map_needs(tmp_path):
+    """Together with a log that has names, the draft counts its columns."""
+    air, camera = two_logs(tmp_path)
+    camera.write_text(camera.read_text().partition("\n")[2])
+    with pytest.raises(
+        InputError, match=r"among unnamed columns, .* header = false in \[file\.NAME"
+    ):
+        draft_map(camera)
+    drafted = draft_of_map([camera, air])
+    assert drafted.lacks == ("key_points",)
+    assert 'match = "*_cam.csv"\nheader = false' in drafted.text
+    assert "# positions = [[1, 2, 3], ...]" in drafted.text
+
+
 def test_a_list_of_columns_says_how_many_it_leaves_out(tmp_path):
     path = tmp_path / "a.csv"
     names = [f"n{k}" for k in range(13)]

@@ -196,6 +196,15 @@ FILES = [
         'separator = ";"\ndecimal = ","',
         "line 2, column 'u': got '1.234,5', expected a number with a decimal comma and without th",
     ),
+    (
+        "0,41.2040,112.050,-84.8,run\n1,2,3,4,run\n2,3,4,5,run\n",
+        "",
+        "no column 'u', the line of names holds numbers (0, 41.2040, 112.050, ...); if the file "
+        "has no header, set header = false in [file.NAME] of the map and give columns by their "
+        "numbers, counted from 1",
+    ),
+    ("t,1,2,3,4\n1,2,3,4,5\n", "", "the line of names holds numbers (t, 1, 2, ...); if the file"),
+    ("t,a,b,3,4\n1,2,3,4,5\n", "", "no column 'u', expected one of t, a, b, 3, 4"),
     (RAW, "skip_rows = 9", "fewer than the 9 lines that the map skips"),
     ("\0\1\2" + RAW, "", "not a text file"),
 ]

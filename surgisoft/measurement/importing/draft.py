@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from surgisoft.errors import InputError
-from surgisoft.measurement.importing.raw import FileRole
+from surgisoft.measurement.importing.raw import LEAST_NUMBERS, FileRole
 from surgisoft.measurement.importing.readers import chosen, no_text, open_raw
 from surgisoft.measurement.importing.readers.text import READER as TEXT
 from surgisoft.measurement.recordings.columns import MM_PER
@@ -26,9 +26,6 @@ SEPARATORS = (";", "\t", ",", "whitespace")
 """Separators that are tried; the one that gives the most columns of numbers is taken."""
 LOOKED_AT = 400
 """Most lines in which the first row of numbers is looked for (a count)."""
-LEAST_NUMBERS = 0.8
-"""Least share of the cells of a row of numbers that are numbers or empty [-]; the others may be
-words, such as the name of a phase."""
 SHOWN = 12
 """Most names of columns that a message lists (a count)."""
 NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?|nan|n/a|", re.I)
@@ -180,8 +177,8 @@ def draft_of_map(paths: Sequence[str | Path]) -> MapDraft:
             f"column = {main.named([main.runs])[0]}",
         ]
     for role, each in roles.items():
-        used = {column for point in each.points for column in point} if each is main else set()
-        used |= {each.time, each.runs if each is main else None}
+        used = {each.time} if each is not main else {each.time, each.runs}
+        used |= {column for point in each.points for column in point} if each is main else set()
         used |= {*each.measured} if sensed and sensed[0] == role else set()
         used |= {*each.commanded} if wanted and wanted[0] == role else set()
         unused = [name for k, name in enumerate(each.layout.names) if name and k not in used]

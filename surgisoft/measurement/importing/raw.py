@@ -23,6 +23,11 @@ Column = Annotated[str | int, A_COLUMN]
 SEPARATOR = Rule(
     "one character or 'whitespace'", lambda text: text == "whitespace" or len(text) == 1
 )
+LEAST_NUMBERS = 0.8
+"""Least share of the cells of a row of numbers that are numbers or empty [-]; the others may be
+words, such as the name of a phase."""
+SHOWN_NUMBERS = 3
+"""Most of such names that a message lists (a count)."""
 TIME_UNIT = one_of((*SECONDS_PER, "iso"))
 
 
@@ -120,6 +125,13 @@ class RawTable:
         if self.advice:
             count = f"{len(named)} column{'s' * (len(named) > 1)}"
             return f"no column '{column}', the map's separator gives {count}; {self.advice}"
+        if sum(_is_number(name) for name in named) >= LEAST_NUMBERS * len(named):
+            shown = ", ".join(named[:SHOWN_NUMBERS]) + (", ..." if named[SHOWN_NUMBERS:] else "")
+            return (
+                f"no column '{column}', the line of names holds numbers ({shown}); if the file has "
+                "no header, set header = false in [file.NAME] of the map and give columns by their "
+                "numbers, counted from 1"
+            )
         near = difflib.get_close_matches(column, named, 1)
         shown = ", ".join(named[:8]) + (", ..." if len(named) > 8 else "")
         hint = f"; did you mean '{near[0]}'?" if near else ""
@@ -146,6 +158,14 @@ class RawTable:
     def texts(self, column: Column) -> list[str]:
         """The cells (T,) of a column as they are written."""
         return self.cells.texts(self.position(column))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text.replace(",", "."))
+    except ValueError:
+        return False
+    return True
 
 
 def _any_file(_: Path) -> bool:

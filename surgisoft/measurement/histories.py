@@ -8,6 +8,7 @@ import torch
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.measurement.noise import known_noise
 from surgisoft.measurement.recordings import Recording
+from surgisoft.measurement.units import factor
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.history import History, pack
 
@@ -233,9 +234,15 @@ def check_fits(spec: ArmSpec, recordings: list[Recording], sized: bool = True) -
             ("actuation unit", recording.unit, spec.unit),
         ):
             if came != expected:
+                advice = "use recordings of the arm that the model was fitted to"
+                if what == "actuation unit" and factor(recording.unit, spec.unit) is not None:
+                    advice = (
+                        f"if the values are in {expected}, correct unit in [measured] and "
+                        f"[commanded] of the map; if they are in {came}, add "
+                        f'to = "{expected}" there, and import again'
+                    )
                 raise InputError(
-                    f"{recording.label}: {what}: {came}, but the model has {expected}; "
-                    "use recordings of the arm that the model was fitted to"
+                    f"{recording.label}: {what}: {came}, but the model has {expected}; {advice}"
                 )
         extent = _extent_mm(recording.key_points_mm) if sized else float("nan")
         if spec.length_mm and (extent > SIZES * spec.length_mm or extent < spec.length_mm / SIZES):

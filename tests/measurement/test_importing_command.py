@@ -59,6 +59,32 @@ def test_a_model_of_another_arm_is_refused_before_anything_is_written(lab, capsy
     assert not out.with_suffix(".toml").exists()
 
 
+def test_a_unit_that_is_not_the_model_s_is_corrected_or_converted(lab, capsys):
+    """Both ways that the message names lead on: values in kPa are kept, and 1 psi is 6.894757."""
+    three = MAP.replace('["u"]', '["u", "v", "w"]').replace(
+        '[["x", "y", "z"]]', str([[f"x{k}", "y", "z"] for k in range(5)])
+    )
+    names = "u,v,w,x0,x1,x2,x3,x4,y,z"
+    rows = "\n".join(f"{k},1,2,{','.join(['0.001'] * 7)}" for k in range(5))
+    (lab / "raw.csv").write_text(f"{names}\n{rows}\n")
+    given = ["import", lab / "raw.csv", "--map", lab / "map.toml", "-o", lab / "rec.csv", "--model"]
+    (lab / "map.toml").write_text(three.replace('"kPa"', '"psi"'))
+    assert surgisoft(*given, "default") == 2
+    said = capsys.readouterr().err
+    assert "actuation unit: psi, but the model has kPa; if the values are in kPa, correct" in said
+    assert 'if they are in psi, add to = "kPa" there, and import again' in said
+    for field, scale in (('"kPa"', 1.0), ('"psi"\nto = "kPa"', 6.894757)):
+        (lab / "map.toml").write_text(three.replace('"kPa"', field))
+        given[5] = lab / f"rec{scale}.csv"
+        assert surgisoft(*given[:-1]) == 0
+        read = load_recording(given[5])
+        assert read.unit == "kPa"
+        np.testing.assert_allclose(read.measured[:, 0], scale * np.arange(5.0), rtol=1e-6)
+    (lab / "map.toml").write_text(three.replace('"kPa"', '"deg"'))
+    assert surgisoft(*given, "default") == 2
+    assert "use recordings of the arm that the model was fitted to" in capsys.readouterr().err
+
+
 def test_files_become_runs_of_one_recording(lab, capsys):
     out = lab / "new" / "rec.parquet"
     raw = [lab / "one.csv", lab / "two.csv"]

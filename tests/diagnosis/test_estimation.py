@@ -573,7 +573,13 @@ def test_a_value_beyond_its_range_may_be_plausible_by_its_interval(value, low, h
 
 @pytest.mark.parametrize(
     ("low", "high", "known"),
-    [(0.02, 6.6e6, False), (0.02, 1500.0, True), (300.0, 6.6e6, True), (80.0, 95.0, True)],
+    [
+        (0.02, 6.6e6, False),
+        (0.02, 1500.0, False),  # ln(15000) / ln(20000) = 0.97 of the range
+        (0.02, 600.0, True),  # 0.88
+        (300.0, 6.6e6, True),
+        (80.0, 95.0, True),
+    ],
 )
 def test_a_value_of_which_nothing_is_learned_is_said_to_be_not_identifiable(low, high, known):
     """A recording of minutes says nothing of a time constant whose interval covers its range."""
@@ -586,12 +592,30 @@ def test_a_value_of_which_nothing_is_learned_is_said_to_be_not_identifiable(low,
 
 @pytest.mark.parametrize(
     ("low", "high", "known"),
-    [(3.6e-5, 3.3e7, False), (0.009, 1e4, False), (0.011, 3.3e7, True), (3.6e-5, 9e3, True)],
+    [(3.6e-5, 3.3e7, False), (0.009, 1e4, False), (0.09, 9.6e3, True), (3.6e-5, 1e3, True)],
 )
 def test_a_range_from_zero_is_covered_by_an_interval_of_a_logarithm(low, high, known):
     """The stress above which a fluid is shear-thinning is positive, as small as it may be."""
     turn = Parameter("rate_dependence", "turn", 226.7, low, high, "", True, (0.0, 1e4), "wide")
     assert turn.identifiable is known
+
+
+def test_an_interval_of_nearly_all_plausible_values_is_not_printed_as_numbers():
+    """A dead time between microseconds and minutes, beside one that a recording determines; of a
+    range with negative values the share counts, and a range that is covered is covered by all."""
+    dead = Parameter(
+        "line_lag", "dead_s", 0.05, 2.635e-6, 1211.0, "s", True, (0.0, 2.0), "wide: tubes"
+    )
+    assert dead.interval_text.endswith("covers nearly all plausible values, 0 to 2")
+    assert replace(dead, low=1e-7).interval_text.endswith("covers all plausible values, 0 to 2")
+    assert replace(dead, low=0.04, high=0.06).interval_text == "0.04 to 0.06"
+    share = replace(dead, value=0.1, plausible_range=(-0.5, 0.5))
+    assert replace(share, low=-0.49, high=0.9).identifiable is False
+    assert replace(share, low=-0.4, high=0.9).identifiable is True
+    both = replace(share, value=[0.1, 0.1], low=[-0.49, -0.4], high=[0.9, 0.9])
+    assert both.identifiable is True
+    for endless in ((0.0, np.inf), (-np.inf, np.inf), (1.0, 1.0)):
+        assert replace(share, low=-0.4, high=0.9, plausible_range=endless).identifiable is True
 
 
 def test_a_page_has_words_and_former_values_of_parameters():

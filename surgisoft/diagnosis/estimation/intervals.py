@@ -45,6 +45,8 @@ DRAWS = 400
 NEGLIGIBLE = 1e-6
 """Share of the largest plausible value that counts as zero: a value that is fitted by its logarithm
 reaches no zero, where its plausible range may begin."""
+NEARLY_ALL = 0.95
+"""Share of the plausible range from which on an interval covers nearly all of it [-]."""
 MOST_VALUES = 9
 """Most values of one quantity that are written out."""
 
@@ -89,14 +91,29 @@ class Parameter:
     def identifiable(self) -> bool:
         """Whether the recordings tell more of the value than its plausible range does.
 
-        They do not where the 95 % interval covers that range for every value: practical
-        non-identifiability (Raue et al. 2009), such as of a time constant of hours in a recording
-        of minutes. A range that begins at zero is covered from NEGLIGIBLE of its end on.
+        They do not where the 95 % interval covers NEARLY_ALL of that range for every value:
+        practical non-identifiability (Raue et al. 2009), such as of a time constant of hours in a
+        recording of minutes.
+        """
+        return not bool(np.all(self._covered >= NEARLY_ALL))
+
+    @property
+    def _covered(self) -> np.ndarray:
+        """Share of the plausible range that the interval of each value covers.
+
+        By the logarithm where the range has no negative values, because it spans decades; one that
+        begins at zero is taken from NEGLIGIBLE of its end on. Nothing is covered of a range without
+        a finite width.
         """
         least, most = self.plausible_range
         least = NEGLIGIBLE * most if least == 0.0 else least
-        low, high = np.asarray(self.low, float), np.asarray(self.high, float)
-        return not bool(np.all((low <= least) & (high >= most)))
+        if not 0.0 < most - least < np.inf:
+            return np.zeros(np.shape(self.low))
+        inside = np.clip([self.low, self.high], least, most)
+        ends = np.array([least, most])
+        if least > 0.0:
+            inside, ends = np.log(inside), np.log(ends)
+        return (inside[1] - inside[0]) / (ends[1] - ends[0])
 
     @property
     def interval_text(self) -> str:
@@ -107,8 +124,9 @@ class Parameter:
         if self.identifiable:
             return text
         least, most = self.plausible_range
+        part = "all" if np.all(self._covered >= 1.0) else "nearly all"
         return (
-            "not identifiable from these recordings: the 95 % interval covers all plausible "
+            f"not identifiable from these recordings: the 95 % interval covers {part} plausible "
             f"values, {values_text(least)} to {values_text(most)}"
         )
 

@@ -243,6 +243,33 @@ def test_examples_of_the_documentation_are_valid(tmp_path):
     assert len(units) == 3, "C3D, MATLAB and HDF5 have one example"
 
 
+def test_the_example_of_two_files_imports_as_the_page_says(tmp_path, monkeypatch, capsys):
+    """The page's files, map and commands; 0.4 of the way from 1.9 to 2.0 psi is 1.94 psi."""
+    text = (DOCS / "recordings.md").read_text().partition("### An example: an air log")[2]
+    text = text.partition("\n### ")[0]
+    for name, body in re.findall(r"```\w+ title=\"(.*?)\"\n(.*?)```", text, re.DOTALL):
+        (tmp_path / name).write_text(body)
+    monkeypatch.chdir(tmp_path)
+    draft, final = re.findall(r"^surgisoft (.*)$", text, re.MULTILINE)
+    assert surgisoft(*draft.split()) == 0
+    drafted, checked = load_map("new.toml"), load_map("lab.toml")
+    assert [role.match for role in drafted.file.values()] == ["*_cam.csv", "*_air.csv"]
+    assert drafted.file == checked.file
+    assert drafted.measured.columns == checked.measured.columns
+    assert drafted.commanded.columns == checked.commanded.columns
+    assert drafted.key_points.positions == checked.key_points.positions
+    assert surgisoft(*final.split()) == 0
+    assert "interpolated linearly in time" in capsys.readouterr().out
+    read = load_recording(tmp_path / "bench.parquet")
+    np.testing.assert_allclose(read.t_s, [0.0, 0.033, 0.066], atol=1e-9)
+    np.testing.assert_allclose(read.measured, [[1.94, 0.04], [2.42, 0.21], [3.9, 0.9]], atol=1e-9)
+    np.testing.assert_allclose(read.commanded, [[2, 0], [4, 1], [4, 1]])
+    np.testing.assert_allclose(read.key_points_mm[:, 0], 0.0, atol=1e-9)
+    tip = [[0, 0, 180], [1, -2, 180], [4, -6, 179.5]]
+    np.testing.assert_allclose(read.key_points_mm[:, 1], tip, atol=1e-9)
+    np.testing.assert_allclose(read.gravity, [0, 0, 1], atol=1e-9)
+
+
 @pytest.mark.parametrize(
     "part", [FileRole, TimeMap, ActuationMap, KeyPointsMap, FrameMap, BaseMap, RowsMap, RunsMap]
 )

@@ -46,6 +46,10 @@ for call in (lambda: save_model(default_arm(), disk / "arm", force=True),
 """
 
 
+MODEL = '{"arm":{},"network":{}}'
+"""What a folder of a model holds, so that it may be replaced."""
+
+
 def test_a_full_disk_leaves_the_old_output(tmp_path):
     """A file system of 300 kB in memory, on which a model of 340 kB cannot be written."""
     if os.geteuid() != 0:
@@ -54,14 +58,14 @@ def test_a_full_disk_leaves_the_old_output(tmp_path):
     disk.mkdir()
     script = (
         f"mount -t tmpfs -o size=300k none {disk} || exit 77; mkdir {disk}/arm;"
-        f"echo '{{}}' > {disk}/arm/config.json; echo old > {disk}/a.csv;"
+        f"echo '{MODEL}' > {disk}/arm/config.json; echo old > {disk}/a.csv;"
         f"{sys.executable} -c '{FULL}' {disk} && cat {disk}/arm/config.json {disk}/a.csv;"
         f"ls -A {disk}"
     )
     done = subprocess.run(["unshare", "-m", "sh", "-c", script], capture_output=True, text=True)
     if done.returncode == 77 or "unshare" in done.stderr:
         pytest.skip("no mount namespaces here")
-    assert done.stdout.split() == ["full", "full", "{}", "old", "a.csv", "arm"], done.stderr
+    assert done.stdout.split() == ["full", "full", MODEL, "old", "a.csv", "arm"], done.stderr
 
 
 def limited(call, path, size: int = 300) -> str:

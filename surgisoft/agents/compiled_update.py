@@ -103,6 +103,8 @@ def _by_rows(plain: Callable[..., Any], count: int) -> Callable[..., Any]:
             return plain(stream, part, action, dt_s)
         try:
             found = fast(stream, part, action, dt_s)
+        except InputError:
+            raise
         except Exception as error:
             if built:
                 raise

@@ -18,7 +18,7 @@ from surgisoft.cli.options import (
 )
 from surgisoft.cli.progress import progress
 from surgisoft.command_line import typed
-from surgisoft.errors import InputError, Interrupted
+from surgisoft.errors import Interrupted
 
 if TYPE_CHECKING:
     from surgisoft.surrogate.model import Validation
@@ -27,8 +27,6 @@ ABOVE_NOISE = 2.0
 """Ratio of the held-out error to the noise from which `fit` advises to try effects with memory."""
 WIDTHS = "128,128,128,128"
 """Default of --widths."""
-WITH_WIDTHS = ("haw_nn", "auto")
-"""Networks with hidden layers whose widths --widths gives."""
 
 
 @app.command()
@@ -112,8 +110,6 @@ def fit(
     out and reported. Ctrl-C keeps the best model so far, and its report.json says where the fit was
     interrupted; before the first validation nothing is written.
     """
-    if network not in WITH_WIDTHS and widths != WIDTHS:
-        raise InputError(f"--widths is for the network haw_nn, not {network}; leave it out")
     train = read_recordings(recordings)
     held = read_recordings(valid) if valid else None
 

@@ -42,6 +42,7 @@ from surgisoft.files import with_former_keys
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
+from surgisoft.surrogate.effects.user_defined import kind_of
 from surgisoft.surrogate.fitted_rows import FittedRows, Use
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.training_residuals import TrainingResiduals
@@ -386,7 +387,8 @@ def improve(
             diagnoses.append(found)
             error = fall_of(problem, problem.with_model(made[-1].model)).after
             current = Round(found.verdict.kind, found.verdict.sentence, None, (), None, error)
-            names = next_effects(found, added)
+            kinds = [kind_of(name) for name in added]
+            names = next_effects(found, kinds)
             if names:
                 sealed.check(table)
             going = False
@@ -395,7 +397,7 @@ def improve(
                     continue
                 tried = attempt(name, found)
                 if tried.strange:
-                    rivals = (attempt(each, found) for each in alternatives(found, name, added))
+                    rivals = (attempt(each, found) for each in alternatives(found, name, kinds))
                     other = next(filter(tried.gives_way_to, rivals), None)
                     if other is not None:
                         why = f"{other.name} in its place: {tried.strange}"
@@ -571,8 +573,8 @@ def _interrupted(steps: list[Round]) -> Round:
 def _step(current: Round, name: str, found: Diagnosis, error_mm: float) -> Round:
     """The round in which the named effect was added."""
     either = found.verdict.effects if found.verdict.kind == "ambiguous" else ()
-    competing = tuple(other for other in either if other != name)
-    sure = next((row.confidence for row in found.ranking if row.effect == name), None)
+    competing = tuple(other for other in either if other != kind_of(name))
+    sure = next((row.confidence for row in found.ranking if row.effect == kind_of(name)), None)
     return replace(
         current, step=name, competing=competing, confidence=sure, error_training_mm=error_mm
     )

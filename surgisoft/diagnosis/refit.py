@@ -45,7 +45,14 @@ from surgisoft.diagnosis.statistics import (
 )
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.progress import Progress, silent
-from surgisoft.surrogate.effects import FRONT, Memoryless, Stage, in_words, known_effects
+from surgisoft.surrogate.effects import (
+    FRONT,
+    Memoryless,
+    Stage,
+    effect_class,
+    in_words,
+    known_effects,
+)
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel, Validation
 from surgisoft.surrogate.training import Data, JointTraining, train_jointly
@@ -319,7 +326,7 @@ def can_hide(name: str) -> bool:
 
 def in_front(names: Iterable[str]) -> list[str]:
     """The effects among them that act in front of the network and can be trained with it."""
-    return [name for name in names if known_effects()[name].stage in FRONT]
+    return [name for name in names if effect_class(name).stage in FRONT]
 
 
 def hideable(problem: Problem, without: Iterable[str] = ()) -> tuple[list[str], dict[str, str]]:
@@ -715,7 +722,7 @@ def check_trainable(model: ArmModel, effects: Iterable[str] = ()) -> None:
             "of 'surgisoft fit' with --network haw_nn; or pass --refit never"
         )
     for name in effects:
-        stage = known_effects()[name].stage
+        stage = effect_class(name).stage
         if stage not in FRONT:
             raise InputError(
                 f"{name} acts on the {stage}, behind the network, and is not fitted together with "

@@ -79,9 +79,9 @@ UNKNOWN = Floor(None, "unknown")
 
 
 def floor_in_words(floor_mm: float, digits: str) -> str:
-    """A noise floor [mm] in words, its number in the format `digits`; `not known` for the least
-    noise, which stands for noise that nothing shows."""
-    return f"{floor_mm:{digits}} mm" if floor_mm > LEAST_NOISE_MM else "not known"
+    """A noise floor [mm] in words, its number in the format `digits`; `unknown` for the least noise
+    that is reckoned with, which stands for noise that nothing shows, or hardly any."""
+    return f"{floor_mm:{digits}} mm" if floor_mm > LEAST_NOISE_MM else "unknown"
 
 
 def noise_of(recordings: list[Recording]) -> tuple[np.ndarray, str]:
@@ -107,6 +107,9 @@ def noise_of(recordings: list[Recording]) -> tuple[np.ndarray, str]:
 LEAST_DIFFERENCES = 30
 """Least number of second differences of a coordinate at the lag, in rows, that noise is taken
 from. Their median is then within some 20 % of its limit."""
+LEAST_STILL = 0.1
+"""Least share of the variance of second differences that stays noise: what is left of a larger
+motion is not known better."""
 MOST_LAG = 100
 """Largest such lag, rows: a camera may be that many times slower than the log."""
 
@@ -136,7 +139,7 @@ def _differences_noise(
             if len(second):
                 variance[number, *place] = (1.4826 * np.median(np.abs(second))) ** 2 / 6.0
     once, twice = variance.sum(2)
-    still = np.maximum(16.0 * once - twice, 0.0) / 15.0
+    still = np.maximum(16.0 * once - twice, 15.0 * LEAST_STILL * once) / 15.0
     noise = np.sqrt(np.where(still < once / 2, still, once))
     source = "second differences" if noise.any() else "unknown"
     return np.maximum(noise, LEAST_NOISE_MM), source

@@ -71,8 +71,9 @@ def fit(
     held = None if valid is None else load_recordings(valid)
     check_same_arm(train)
     spec = arm_spec(train, actuation)
-    _refuse_repeated_rows(train, actuation)
-    if held:
+    if not held:
+        _refuse_repeated_rows(train, actuation)
+    else:
         check_fits(spec, held)
         _refuse_training_rows(train, held, actuation)
     with torch_threads(threads):

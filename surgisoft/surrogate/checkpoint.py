@@ -137,11 +137,13 @@ def claim_folder(folder: str | Path, force: bool = False) -> Path:
 
 
 def _holds_model(folder: Path) -> bool:
-    """Whether the `config.json` of a folder is that of an arm model, of any version."""
+    """Whether the `config.json` of a folder is that of an arm model, of any version, or a damaged
+    file beside a model's weights."""
     try:
         config = read_json(folder / "config.json", LARGEST_CONFIG)
     except (InputError, OSError):
-        return False
+        files = ("config.json", "weights.safetensors")
+        return all((folder / name).is_file() for name in files)
     return isinstance(config, dict) and {"arm", "network"} <= config.keys()
 
 

@@ -632,8 +632,8 @@ def _check_network(config: FitConfig) -> None:
     if set_by_user:
         names = ", ".join(OPTIONS.get(name, name) for name in set_by_user)
         raise InputError(
-            f"the network {config.network} has no setting {names}: expected a fit without; leave "
-            "it out, or fit the network haw_nn"
+            f"the network {config.network} has no setting {names}: expected a fit without it; "
+            "leave it out, or fit the network haw_nn"
         )
 
 

@@ -499,7 +499,7 @@ REFUSED = {
     "import {dir}/folder.rrd --draft {dir}/m.toml": "is a folder, expected one file of it",
     "import {dir}/full.csv --draft {dir}/m.txt": "suffix '.txt', expected .toml",
     "import {dir}/full.csv --draft {dir}/old.toml": "old.toml: exists already; choose another",
-    "fit {rec} --network kernel --widths 8,8 -o {dir}/m": "--widths is for the network haw_nn, not",
+    "fit {rec} --network kernel --widths 8,8 -o {dir}/m": "kernel has no setting --widths",
     "diagnose default {rec} --apply {dir}/a --no-setup-tests": "leave --no-setup-tests out",
     "run mixed -o {dir}/a.csv --observer-gain 0.2": "a schedule observes nothing: leave --no-cam",
     "run mixed -o {dir}/a.csv --no-cameras": "a schedule observes nothing: leave --no-cameras and",

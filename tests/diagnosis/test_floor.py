@@ -164,13 +164,18 @@ def test_a_motion_of_few_rows_is_not_taken_for_noise(amplitude_mm):
     assert noise[-1] == pytest.approx(FLOOR, rel=0.4)
 
 
-def test_a_motion_without_noise_has_no_floor():
-    """Every second difference of a parabola is the same, and four times as large at twice the lag:
-    nothing is left of it."""
+def test_a_motion_without_noise_keeps_a_tenth_of_it():
+    """Every second difference of a parabola is the same, and four times as large at twice the lag;
+    a tenth of its variance stays, because a motion tells no smaller noise."""
     made = recording(np.zeros(600), walk(600), noise_mm=None)
     parabola = np.square(np.arange(600) / 8.0)  # exact in binary
     points = np.broadcast_to(parabola[:, None, None], made.key_points_mm.shape)
     noise, source = noise_of([replace(made, key_points_mm=points)])
-    assert source == "unknown"
-    assert floor_in_words(noise[0], ".3f") == "not known"
+    assert source == "second differences"
+    size = 1.4826 * (2 / 8.0**2) / np.sqrt(6)  # of a coordinate, were all of it noise
+    assert noise == pytest.approx(np.full(3, np.sqrt(0.1 * 3) * size))
+
+
+def test_a_floor_in_words():
+    assert floor_in_words(1e-4, ".3f") == "unknown"
     assert floor_in_words(0.25, ".3f") == "0.250 mm"

@@ -706,6 +706,7 @@ def test_what_effects_behind_the_network_do_is_not_learned_by_it(lagging):
     before, after = (split.losses(each).sum() for each in (model, trained))
     assert after < 1.2 * before, "5 mm twice are 100 times the squared error"
     assert in_front(["misalignment", "line_lag", "creep"]) == ["line_lag", "creep"]
+    assert in_front(["hysteresis#2", "misalignment#2"]) == ["hysteresis#2"]
 
 
 def test_a_joint_fit_keeps_the_parameters_of_effects_that_it_did_not_train(found):

@@ -29,7 +29,7 @@ from surgisoft.diagnosis.estimation.least_squares import (
 from surgisoft.diagnosis.estimation.network_error import NetworkError
 from surgisoft.diagnosis.residuals import Problem
 from surgisoft.errors import InputError
-from surgisoft.surrogate.effects import Effect, free_name, hypothesis_of
+from surgisoft.surrogate.effects import Effect, free_name
 from surgisoft.surrogate.model import ArmModel
 
 LARGE = 24
@@ -145,7 +145,8 @@ def _ended(
     keys: dict[str, str] = {}
     for position, name in enumerate(names):
         if name not in model.effects:
-            beside = [each for each in names[:position] if not is_large(model.effects[each])]
+            former = [keys.get(each, each) for each in names[:position]]
+            beside = [each for each in former if not is_large(model.effects[each])]
             model, *rest = _added(problem.with_model(model), name, beside)
             if len(names) == 1 and rest:
                 model, others = _best_end(problem, name, [model, *rest], slopes_at_end)
@@ -170,7 +171,8 @@ def _ended(
 def _one_more(problem: Problem, name: str) -> ArmModel | None:
     """The problem's model with one more effect of a kind that it has, roughly fitted; None where
     that leaves no less than the present one, fitted anew, or where there can be one only."""
-    if hypothesis_of(problem.model.effects[name]).grid_further is None:
+    tried = model_candidates(problem, [name])
+    if all(each.more for each in tried):  # no further form, or none that these recordings show
         return None
     anew = copy.deepcopy(problem.model)
     present = _rough(anew, problem, [name])

@@ -30,6 +30,7 @@ from surgisoft.report import (
 from surgisoft.report.charts import BLUE, GREEN, RED, chart, drawing
 from surgisoft.report.style import MUTED
 from surgisoft.surrogate.effects import known_effects
+from surgisoft.surrogate.effects.user_defined import kind_of
 from surgisoft.time_axis import with_gaps
 
 HOW = (
@@ -317,7 +318,7 @@ MOST_WORDS = 6
 
 def effect_words(name: str) -> str:
     """Description of an effect in one sentence: the first of its docstring."""
-    found = known_effects().get(name)
+    found = known_effects().get(kind_of(name))
     return (inspect.getdoc(found) or "").split("\n")[0] if found is not None else ""
 
 

@@ -34,8 +34,8 @@ class Knots:
         widest = float((self.high - self.low).max())
         if not widest >= LEAST_RANGE:
             raise InputError(
-                f"limits {limits.tolist()}: the widest range is {widest:g} kPa, expected at least "
-                f"{LEAST_RANGE:g} kPa; are the limits in another unit?"
+                f"limits {limits.tolist()}: the widest range is {widest:g}, expected at least "
+                f"{LEAST_RANGE:g}; state the limits in a smaller unit, such as kPa"
             )
         self.rest = np.clip(np.zeros(len(limits)), self.low, self.high)
         """(m,) actuation of an arm at rest: the one nearest to zero [kPa]."""

@@ -184,7 +184,7 @@ def recording_log(
         try:
             yield log
         except BaseException:
-            if not log.samples:
+            if not log.samples and path.is_file():  # no device or pipe
                 path.unlink(missing_ok=True)
             raise
         finally:

@@ -156,12 +156,13 @@ def test_cameras_slower_than_the_log_show_their_noise(every):
 
 @pytest.mark.parametrize("amplitude_mm", [0.0, 4.0, 10.0])
 def test_a_motion_of_few_rows_is_not_taken_for_noise(amplitude_mm):
-    """20 rows in a period: at 10 mm the motion's second differences are six times the noise's."""
+    """20 rows in a period: at 10 mm the motion's second differences are six times the noise's, of
+    whose variance a tenth stays."""
     wave = np.sin(2 * np.pi * np.arange(3000) / 20)
     made = recording(amplitude_mm * wave, 5 + wave[:, None] * [1.0, 0.5], noise_mm=None)
     noise, source = noise_of([made])
     assert source == "second differences"
-    assert noise[-1] == pytest.approx(FLOOR, rel=0.4)
+    assert 0.6 * FLOOR < noise[-1] < 1.6 * FLOOR
 
 
 def test_a_motion_without_noise_keeps_a_tenth_of_it():

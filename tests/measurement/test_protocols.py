@@ -238,7 +238,7 @@ def test_limits_that_are_no_ranges_get_one_line():
     for limits in ([[0.0, 0.0]], [[5.0, 1.0]], [[0.0, np.nan]], [0.0, 1.0], np.zeros((0, 2))):
         with pytest.raises(InputError, match="expected a finite lowest and highest actuation"):
             make_protocol("walk", limits)
-    with pytest.raises(InputError, match=r"widest range is 0.001 kPa, expected at least 0.1 kPa"):
+    with pytest.raises(InputError, match=r"widest range is 0.001, expected at least 0.1; state"):
         make_protocol("ramps", [[0.0, 1e-3]])
 
 

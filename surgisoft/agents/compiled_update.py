@@ -52,34 +52,42 @@ def compiled_update(ppo: PPO) -> Callable[[], dict[str, float]]:
     rsl-rl's; the sums of the kernels are added in another order, so that weights agree to rounding.
     """
     check_compiler(torch.device(ppo.device))
-    compiled = torch.compile(PPOLoss(ppo), fullgraph=True, dynamic=False)
-    built = False
+    compiled = _told(torch.compile(PPOLoss(ppo), fullgraph=True, dynamic=False))
 
     def losses(batch: Any) -> tuple[Tensor, ...]:
-        nonlocal built
         mean, deviation = batch.old_distribution_params
         given = (batch.actions, batch.values, batch.advantages, batch.returns)
         seen = [
             torch.cat([batch.observations[group] for group in network.obs_groups], dim=-1)
             for network in (ppo.actor, ppo.critic)
         ]
-        try:
-            found = compiled(*seen, *given, batch.old_actions_log_prob, mean, deviation)
-        except Exception as error:
-            if built:
-                raise
-            raise _not_built(error) from error
-        built = True
-        return found
+        return compiled(*seen, *given, batch.old_actions_log_prob, mean, deviation)
 
     return lambda: _update(ppo, losses)
 
 
-def _not_built(error: Exception) -> CompileFailed:
-    cause = getattr(error, "inner_exception", error)
-    return CompileFailed(
-        f"--compile: torch.compile fails here: {reason_of(cause)}; leave the option out"
-    )
+def _told(compiled: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of `torch.compile` whose first call raises `CompileFailed` where it cannot be
+    built. An InputError of what it computes is raised as it is."""
+    built = False
+
+    def call(*given: Any) -> Any:
+        nonlocal built
+        try:
+            found = compiled(*given)
+        except InputError:
+            raise
+        except Exception as error:
+            if built:
+                raise
+            cause = getattr(error, "inner_exception", error)
+            raise CompileFailed(
+                f"--compile: torch.compile fails here: {reason_of(cause)}; leave the option out"
+            ) from error
+        built = True
+        return found
+
+    return call
 
 
 def compile_arms(world: World, count: int) -> None:
@@ -95,22 +103,11 @@ def compile_arms(world: World, count: int) -> None:
 
 
 def _by_rows(plain: Callable[..., Any], count: int) -> Callable[..., Any]:
-    fast, built = torch.compile(plain, dynamic=False), False
+    fast = _told(torch.compile(plain, dynamic=False))
 
     def step(stream: Any, part: Any, action: Tensor, dt_s: float) -> Any:
-        nonlocal built
-        if len(action) != count:
-            return plain(stream, part, action, dt_s)
-        try:
-            found = fast(stream, part, action, dt_s)
-        except InputError:
-            raise
-        except Exception as error:
-            if built:
-                raise
-            raise _not_built(error) from error
-        built = True
-        return found
+        work = fast if len(action) == count else plain
+        return work(stream, part, action, dt_s)
 
     return step
 

@@ -139,7 +139,10 @@ def amend(
         print(f"{name}: the model had this effect already; its parameters were fitted again")
     for name in result.effects:
         if "#" in name:
-            print(f"{name}: one more of its kind, which leaves less than that of the model does")
+            print(
+                f"{name}: added beside the one of the model, because fitting that one again leaves "
+                "a larger error"
+            )
     show_parameters(result.parameters, result.in_words)
     if result.retuned:
         print(

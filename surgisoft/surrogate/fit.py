@@ -320,7 +320,10 @@ class Interruption:
         if not self.used:
             model = f"that of the finished stages: {', '.join(self.finished)}"
             if self.unproved:
-                model += f", with {self.unproved}, which lowers their held-out error"
+                model += (
+                    f", with {self.unproved}, which halves their squared held-out error but was "
+                    "not compared with equally long training without it"
+                )
         return f"the fit was interrupted in '{self.stage}'{after}; the model is {model}"
 
 

@@ -154,15 +154,16 @@ def test_cameras_slower_than_the_log_show_their_noise(every):
     assert table.floor.rmse_mm == pytest.approx(FLOOR, rel=0.1)
 
 
-@pytest.mark.parametrize("amplitude_mm", [0.0, 4.0, 10.0])
-def test_a_motion_of_few_rows_is_not_taken_for_noise(amplitude_mm):
-    """20 rows in a period: at 10 mm the motion's second differences are six times the noise's, of
-    whose variance a tenth stays."""
+@pytest.mark.parametrize(("amplitude_mm", "expected"), [(0.0, FLOOR), (4.0, FLOOR), (10.0, 0.135)])
+def test_a_motion_of_few_rows_is_not_taken_for_noise(amplitude_mm, expected):
+    """20 rows in a period: second differences have an amplitude of 4 sin^2(pi / 20) = 0.0979. At
+    10 mm they pass for (1.4826 / sqrt(6)) sin(45 degrees) 0.979 = 0.419 mm of noise in x, and with
+    that of three coordinates a tenth of the variance stays: sqrt(0.1 (0.419^2 + FLOOR^2))."""
     wave = np.sin(2 * np.pi * np.arange(3000) / 20)
     made = recording(amplitude_mm * wave, 5 + wave[:, None] * [1.0, 0.5], noise_mm=None)
     noise, source = noise_of([made])
     assert source == "second differences"
-    assert 0.6 * FLOOR < noise[-1] < 1.6 * FLOOR
+    assert noise[-1] == pytest.approx(expected, rel=0.4)
 
 
 def test_a_motion_without_noise_keeps_a_tenth_of_it():

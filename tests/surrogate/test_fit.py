@@ -402,7 +402,7 @@ def test_ctrl_c_keeps_an_effect_that_lowers_the_held_out_error(running):
     result = ended.value.result
     where, (first, second) = result.interrupted, result.stages
     assert (where.stage, where.finished, where.unproved) == (running, ("pressure",), "line_lag")
-    assert where.sentence.endswith("pressure, with line_lag, which lowers their held-out error")
+    assert "pressure, with line_lag, which halves their squared held-out error" in where.sentence
     assert list(result.model.effects) == ["line_lag"]
     assert (first.reason, second.reason) == ("", "interrupted")
     assert second.valid_rmse_mm < 0.5 * first.valid_rmse_mm

@@ -2,10 +2,12 @@
 
 The parameters are fitted to the training rows, three quarters of each recording; together with the
 whole network where that may have imitated the effect. The held-out quarter is opened once, for the
-error before and after, and chooses nothing: the new model is the same whatever is in it. A fall of
-the error is claimed only where its 95 % interval, from a bootstrap of blocks of time, is above
-zero, where the fall is large enough to matter, and where the network's own error would hardly have
-been fitted by so much of the effects.
+error before and after, and chooses nothing: the new model's parameters are the same whatever is in
+it. The error that the model states of itself is no less than that on these rows (`amended_error`).
+
+A fall of the error is claimed only where its 95 % interval, from a bootstrap of blocks of time, is
+above zero, where the fall is large enough to matter, and where the network's own error would hardly
+have been fitted by so much of the effects.
 """
 
 import time
@@ -14,6 +16,7 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
+from surgisoft.diagnosis.amended_error import state_error, state_residuals
 from surgisoft.diagnosis.data_quality import FAR_ROWS, far_share
 from surgisoft.diagnosis.diagnose import lacking_before
 from surgisoft.diagnosis.estimation.effects import fit_effects
@@ -411,8 +414,9 @@ def amend(
         if both is not None and both.used:
             held_out = before_and_after(opened, earlier, "always").table.final_check()
         alone = fall_of(held_out, held_out.with_model(fitted.model), fitted.p_value)
-        # The residuals of the fit say nothing of a network that was re-tuned since.
-        better.training_residuals = None if retuned else model.training_residuals
+        state_residuals(better, model, retuned)
+        if alone.claimed:
+            state_error(better, model, whole)
     use: Use = "fitted" if retuned or judged is not None else "amended"
     better.fitted_rows = FittedRows.of([plain.history], use).joined(model.fitted_rows)
     found = Estimates(list(parameters), words)

@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 
 from surgisoft.diagnosis.amend import Fall, Track, fall_of, of_change, track_of
+from surgisoft.diagnosis.amended_error import state_error, state_residuals
 from surgisoft.diagnosis.diagnose import (
     Diagnosis,
     diagnose,
@@ -107,8 +108,8 @@ class _Made:
     """A model of the loop, with what belongs to it."""
 
     model: ArmModel
-    known: TrainingResiduals | None
-    """Residuals on the rows of its fit; None where the network was re-tuned since."""
+    fitted: ArmModel
+    """The model of the fit: the given one, or that of the last fit together with the network."""
     parameters: tuple[Parameter, ...] = ()
     in_words: dict[str, str] = field(default_factory=dict)
 
@@ -279,7 +280,7 @@ def improve(
         before, reference = reference, None
     model, recordings, before = open_model(model, recordings, before, None, error_mm)
     model, recordings, notes = open_inputs(model, recordings, compared=before is not None)
-    known, sealed = model.training_residuals, Sealed(recordings)
+    sealed = Sealed(recordings)
     recordings = sealed.training
     table = residual_table(model, recordings)
     problem = table.training()
@@ -299,7 +300,7 @@ def improve(
         problem = both.table.training()
         asked = both.training()
     is_paired = both is not None and both.used
-    made, rounds = [_Made(model, known)], []
+    made, rounds = [_Made(model, model)], []
     diagnoses: list[Diagnosis] = []
     added: list[str] = []
     anew: list[str] = []  # of these, what was fitted in another form
@@ -318,7 +319,7 @@ def improve(
         return diagnose(
             current.model,
             recordings,
-            reference=current.known if reference is None else reference,
+            reference=current.fitted.training_residuals if reference is None else reference,
             refit=refit,
             refit_progress=refit_progress,
             processes=processes,
@@ -343,7 +344,7 @@ def improve(
         fall = fall_of(posed, problem.with_model(fitted.model))
         if _doubt(name, fall, fitted.parameters):
             return False
-        made.append(_Made(fitted.model, made[-1].known, fitted.parameters, fitted.in_words))
+        made.append(_Made(fitted.model, made[-1].fitted, fitted.parameters, fitted.in_words))
         note(replace(_step(current, name, found, fall.after), anew=True))
         return True
 
@@ -408,14 +409,16 @@ def improve(
                     continue
                 going = True
                 added.append(tried.name)
-                known = made[-1].known
+                of_fit = made[-1].fitted
                 if isinstance(tried.fitted, JointFit):
                     trained = True
-                    known = tried.fitted.model.training_residuals
+                    of_fit = tried.fitted.model
                     discrepancy = model_discrepancy(tried.fitted.model, problem.noise_mm)
                     problem = replace(problem, discrepancy_mm=discrepancy)
                 made.append(
-                    _Made(tried.fitted.model, known, tried.fitted.parameters, tried.fitted.in_words)
+                    _Made(
+                        tried.fitted.model, of_fit, tried.fitted.parameters, tried.fitted.in_words
+                    )
                 )
                 together = isinstance(tried.fitted, JointFit)
                 note(
@@ -436,7 +439,7 @@ def improve(
                 f"{100 * tuned.gain:.0f} % in the quarters of the training part that were left out "
                 "of its fit and of the effects' fit in turn"
             )
-            made.append(replace(made[-1], model=tuned.model, known=None))
+            made.append(replace(made[-1], model=tuned.model))
             note(Round(RETUNED, why, NETWORK, (), None, after))
 
     try:
@@ -449,9 +452,10 @@ def improve(
         rounds.append(_interrupted(steps))
     final_model = made[-1].model
     if final_model is not model:
-        # The residuals of the fit say nothing of a network that was re-tuned since.
-        final_model.training_residuals = made[-1].known
-        trained = any(done.together or done.step == NETWORK for done in rounds)
+        retuned = any(done.step == NETWORK for done in rounds)
+        of_fit = made[-1].fitted
+        state_residuals(final_model, of_fit, retuned)
+        trained = retuned or any(done.together for done in rounds)
         use: Use = "fitted" if trained else "amended"
         final_model.fitted_rows = FittedRows.of([table.history], use).joined(model.fitted_rows)
     sealed.check(table)
@@ -481,6 +485,8 @@ def improve(
         model_error=fall_of(whole, whole.with_model(final_model)) if is_paired else None,
         in_words=words,
     )
+    if result.held_out.claimed:
+        state_error(final_model, made[-1].fitted, whole)
     if result.interrupted:
         raise Interrupted(result)
     return result

@@ -683,9 +683,17 @@ def model_discrepancy(model: ArmModel, noise_mm: np.ndarray) -> np.ndarray:
         [value or 0.0 for value in stated.per_key_point_mm]
         or [0.05 * (spec.length_mm or 50.0)] * spec.key_points
     )
-    own = stated.noise_mm
-    noise = noise_mm if own is None else np.full(len(validated), np.sqrt(3.0) * own)
+    noise = noise_of_validation(model, noise_mm)
     return np.sqrt(np.maximum(validated**2 - noise**2, (LEAST_DISCREPANCY * validated) ** 2))
+
+
+def noise_of_validation(model: ArmModel, noise_mm: np.ndarray) -> np.ndarray:
+    """(n,) RMS noise of each key point's distance in the rows that validated a model, mm.
+
+    noise_mm: (n,) what it is taken for where the model does not state it.
+    """
+    own = model.validation.noise_mm
+    return noise_mm if own is None else np.full(len(noise_mm), np.sqrt(3.0) * own)
 
 
 # Whose arm it is ----------------------------------------------------------------------------------

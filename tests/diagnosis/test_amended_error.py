@@ -1,0 +1,97 @@
+"""What an amended model states of its own error, against predictions of the model itself."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from surgisoft.diagnosis.amend import amend
+from surgisoft.diagnosis.improve import improve
+from surgisoft.measurement.histories import history_of
+from surgisoft.surrogate.checkpoint import load_model, save_model
+from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.training import validated_error
+from tests.diagnosis.test_estimation import NOISE_MM, TRUTHS, bare_arm, measured_on
+
+FLOOR_MM = np.sqrt(3.0) * NOISE_MM
+
+
+def fitted_to(truth: ArmModel) -> ArmModel:
+    """The bare arm as if `truth`, which has an effect more, had been recorded for its fit."""
+    arm = bare_arm()
+    of_fit, validation = (history_of([measured_on(truth, seed=seed)]) for seed in (7, 8))
+    arm.training_residuals = arm.residuals_on([of_fit])
+    pair = (validation.rows(x) for x in (validation.key_points, arm.predict(validation)))
+    arm.validation = replace(validated_error(*pair), noise_mm=NOISE_MM)
+    return arm
+
+
+@pytest.mark.parametrize("step", ["amend", "improve"])
+def test_an_effect_that_the_fit_lacked_takes_its_part_of_the_stated_error_away(step):
+    truth = TRUTHS["creep"]
+    arm = fitted_to(truth)
+    stated = arm.validation
+    assert stated.rmse_mm > 3 * FLOOR_MM
+    recorded = measured_on(truth, seed=1)
+    if step == "amend":
+        found = amend(arm, [recorded], "creep", refit="never")
+    else:
+        found = improve(arm, [recorded], refit="never")
+    error = found.model.validation
+    # On the held-out rows the noise is left, and the model states no less.
+    assert found.held_out.after == pytest.approx(FLOOR_MM, rel=0.03)
+    assert found.held_out.after * 0.99 <= error.rmse_mm <= 1.1 * FLOOR_MM
+    pairs = zip(error.per_key_point_mm, stated.per_key_point_mm, strict=True)
+    assert all(now <= was for now, was in pairs)
+    # Its residuals of the fit are those that it would have had there.
+    direct = found.model.residuals_on([history_of([measured_on(truth, seed=7)])])
+    kept = found.model.training_residuals
+    assert torch.allclose(kept.residual_mm, direct.residual_mm, atol=2e-4)
+    assert kept.actuation.equal(arm.training_residuals.actuation)
+    # The given model stays as it is.
+    assert arm.validation == stated
+    assert arm.training_residuals.residual_mm.square().mean() > 2 * kept.residual_mm.square().mean()
+
+
+def test_an_arm_that_changed_since_the_fit_leaves_the_stated_error_as_it_is():
+    arm = fitted_to(bare_arm())
+    found = amend(arm, [measured_on(TRUTHS["creep"], seed=1)], "creep", refit="never")
+    assert found.claimed
+    assert found.model.validation == arm.validation
+    assert found.model.training_residuals is arm.training_residuals
+
+
+def test_no_key_point_states_less_than_its_error_on_the_held_out_rows():
+    """The tip's marker sits 1 mm aside in the recording: the error of the tip stays that large."""
+    truth = TRUTHS["creep"]
+    arm = fitted_to(truth)
+    recorded = measured_on(truth, seed=1)
+    points = recorded.key_points_mm.copy()
+    points[:, -1, 0] += 1.0
+    moved = replace(recorded, key_points_mm=points)
+    found = amend(arm, [moved], "creep", retune_network=False, refit="never")
+    assert found.alone.claimed
+    held = found.held_out.after
+    tip = found.model.validation.per_key_point_mm[-1]
+    assert tip == pytest.approx(1.0, rel=0.05)
+    others = found.model.validation.per_key_point_mm[:-1]
+    assert max(others) < 1.3 * FLOOR_MM
+    assert held < tip
+
+
+def test_without_the_actuation_before_its_rows_nothing_is_restated():
+    arm = fitted_to(TRUTHS["creep"])
+    arm.training_residuals = replace(arm.training_residuals, past=None)
+    found = amend(arm, [measured_on(TRUTHS["creep"], seed=1)], "creep", refit="never")
+    assert found.claimed
+    assert found.model.validation.rmse_mm == arm.validation.rmse_mm
+
+
+def test_what_is_restated_is_kept_in_the_folder(tmp_path):
+    arm = fitted_to(TRUTHS["creep"])
+    found = amend(arm, [measured_on(TRUTHS["creep"], seed=1)], "creep", refit="never")
+    save_model(found.model, tmp_path / "arm", found.to_json())
+    back = load_model(tmp_path / "arm")
+    assert back.validation.rmse_mm == pytest.approx(found.model.validation.rmse_mm)
+    assert back.training_residuals.residual_mm.equal(found.model.training_residuals.residual_mm)

@@ -741,7 +741,7 @@ def result_of(
         sentence += knock(evidence, recordings) + periodic(evidence)
     told = slipped(evidence, recordings)
     if not told or evidence.jump_count > 1:
-        told += jumping(evidence)
+        told += jumping(evidence, recordings)
     if kind == "unknown_effect":
         sentence += "".join(f"; {each}" for each in told)
         told = []
@@ -868,15 +868,19 @@ def periodic(evidence: Evidence) -> str:
     )
 
 
-def jumping(evidence: Evidence) -> list[str]:
-    """That the body jumps, in words; empty where jumps are not a part of the error."""
+def jumping(evidence: Evidence, recordings: int = 1) -> list[str]:
+    """That the body jumps, in words; empty where jumps are not a part of the error.
+
+    recordings: how many there are.
+    """
     if evidence.jumps < CLEAR_JUMPS:
         return []
     often = "once" if evidence.jump_count == 1 else f"{evidence.jump_count} times"
+    when = f"at {evidence.jump_largest_s:.2f} s" + ", all recordings in turn" * (recordings > 1)
     return [
-        f"the body jumps {often}, by up to {evidence.jump_largest_mm:.3g} mm, while neither the "
-        "actuation nor the predicted motion jumps (possible causes: stick-slip friction, "
-        "snap-through of the wall, impacts on the arm or its base, lost markers)"
+        f"the body jumps {often}, by up to {evidence.jump_largest_mm:.3g} mm ({when}), while "
+        "neither the actuation nor the predicted motion jumps (possible causes: stick-slip "
+        "friction, snap-through of the wall, impacts on the arm or its base, lost markers)"
     ]
 
 

@@ -192,6 +192,8 @@ class Evidence:
     """Number of these jumps."""
     jump_largest_mm: float = 0.0
     """RMS displacement of the key points in the largest of them, mm."""
+    jump_largest_s: float = 0.0
+    """Moment of that one, s, all recordings in turn; 0 in stored evidence that does not have it."""
     shift: float = 0.0
     """Root of the share of the error above the noise that the shift of one key point against the
     others makes, times the log gain of the shift in the error of that key point; 0 where others
@@ -278,11 +280,12 @@ def abrupt_changes(problem: Problem) -> dict[str, Any]:
     """The numbers of `Evidence` on jumps of the body and on a key point that shifts."""
     table = problem.table
     body, shift = table.jumps or body_jumps(table), key_point_shift(problem)
-    sizes = body.jumps.sizes_mm
+    sizes, along_s = body.jumps.sizes_mm, table.along_s[table.timed]
     return {
         "jumps": body.share,
         "jump_count": len(sizes),
         "jump_largest_mm": float(sizes.max(initial=0.0)),
+        "jump_largest_s": float(along_s[body.jumps.rows[0]]) if len(sizes) else 0.0,
         "shift": shift.clarity if shift else 0.0,
         "shift_mm": shift.shift_mm if shift else 0.0,
         "shift_key_point": shift.key_point if shift else -1,

@@ -32,6 +32,10 @@ more than white noise of its size. The one that does best on held-out blocks is 
 LARGE = 48
 """Number of sensitivities from which what many sets have in common is factorised once for all. It
 decides on processor time alone: results are equal but for rounding."""
+FAINT = 1e-12
+"""Least power of a sensitivity, as a share of the largest one of a set, that it is scaled by."""
+FAINTEST = 1e-30
+"""Least power that counts as the largest one of a set, mm^2."""
 STRIP = 1 << 20
 """Numbers of a field that are worked through at once: 4 MB, of which the cache holds a few."""
 REFERENCE_WEIGHT = 3.0
@@ -274,7 +278,8 @@ class CrossValidation:
     held_out: "HeldOut"
     """The same of what the static part leaves on each held-out block."""
     by_fold: "HeldOut"
-    """Sums of `held_out` over the blocks of each fold."""
+    """Sums of `held_out` over the blocks of each fold. Levels lie one after another among the
+    blocks, (1, ..., L folds): all are looked at together, and a line of the cache holds them."""
     turned: list[np.ndarray]
     """For each fold (F, n, 3, 1 + K) products of the static part's basis and `fields`."""
     solved: dict = field(default_factory=dict)
@@ -298,7 +303,7 @@ class CrossValidation:
         grams, lines = _products(split, both, turned)
         grams[:, :, 0, 0] += np.square(known, dtype=float).sum()
         held_out = HeldOut.of(lines, both.shape[3])
-        by_fold = HeldOut.of(split.by_fold(lines), both.shape[3])
+        by_fold = HeldOut.of(_side_by_side(split.by_fold(lines)), both.shape[3])
         return cls(split, (both,), grams, held_out, by_fold, turned)
 
     def extended(self, sensitivities: np.ndarray) -> "CrossValidation":
@@ -314,7 +319,7 @@ class CrossValidation:
             fields,
             grams,
             self.held_out.extended(border),
-            self.by_fold.extended(self.split.by_fold(border)),
+            self.by_fold.extended(_side_by_side(self.split.by_fold(border))),
             whole,
             dict(self.solved),
             dict(self.best),
@@ -356,6 +361,54 @@ class CrossValidation:
             self.best[key] = losses[0, 0]
         return self.best[key]
 
+    def losses_without_each(self, groups: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
+        """(B,) `losses` with the sensitivities of all groups but one, for each group in turn.
+
+        groups: sensitivities, each in one group. The normal matrices of all are inverted once; what
+        leaving out a group changes follows from its own part of the inverse (elimination by
+        blocks, Golub & Van Loan 2013, section 3.2), a small part of a new solution.
+        """
+        everything = _rising([one for group in groups for one in group])
+        rests = [np.setdiff1d(everything, group) for group in groups]
+        for rest, found in zip(rests, self._without_each(everything, groups), strict=False):
+            if rest.tobytes() not in self.solved:
+                self._keep(rest, found)
+        return [self.losses(rest) for rest in rests]
+
+    def _without_each(
+        self, everything: np.ndarray, groups: Sequence[tuple[int, ...]]
+    ) -> list[np.ndarray]:
+        """(L, r, folds, k) amplitudes of the sensitivities that each group leaves of everything.
+
+        Empty where a sensitivity is next to nothing beside another one, as `_solve` then scales it
+        by what else is fitted, or where rounding makes a normal matrix indefinite.
+        """
+        levels, folds = self.grams.shape[:2]
+        columns, one = 1 + everything, np.eye(len(everything))
+        out = [np.isin(everything, group) for group in groups]
+        answer = [np.empty((levels, len(RIDGES), folds, int((~some).sum()))) for some in out]
+        for level, number in np.ndindex(levels, folds):
+            gram = self.grams[level, number]
+            own, right = gram[np.ix_(columns, columns)], gram[columns, 0]
+            square = np.diag(own)
+            if not square.size or square.min() <= FAINT * max(square.max(), FAINTEST):
+                return []
+            size = np.sqrt(square)
+            scaled = 0.5 * (own + own.T) / (size[:, None] * size)
+            for place, ridge in enumerate(RIDGES):
+                try:
+                    root = linalg.cholesky(scaled + ridge * one, check_finite=False)
+                except linalg.LinAlgError:
+                    return []
+                half = linalg.lapack.dpotri(root, overwrite_c=True)[0]
+                inverse = np.triu(half) + np.triu(half, 1).T
+                whole = inverse @ (right / size)
+                for found, some in zip(answer, out, strict=True):
+                    change = np.linalg.solve(inverse[np.ix_(some, some)], whole[some])
+                    left = whole[~some] - inverse[np.ix_(~some, some)] @ change
+                    found[level, place, number] = left / size[~some]
+        return answer
+
     def amplitudes(self, chosen: list[int] | tuple[int, ...] | np.ndarray) -> np.ndarray:
         """(k,) amplitudes of the chosen sensitivities, mean over the folds."""
         return self._fitted(np.asarray(chosen, int))[0]
@@ -394,14 +447,24 @@ class CrossValidation:
         key = sensitivities.tobytes()
         if key not in self.solved:
             known = _rising(common if len(common) >= LARGE else ())
-            order = np.concatenate([known, np.setdiff1d(sensitivities, known)])
+            order = sensitivities
+            if len(known):
+                order = np.concatenate([known, np.setdiff1d(sensitivities, known)])
             none = np.empty((*self.grams.shape[:2], len(RIDGES), 0, 0))
             found = self._amplitudes(order, self._factors(known), none)
-            amplitudes = np.ascontiguousarray(found[..., np.argsort(order)])
-            folds = np.arange(len(self.split.held))
-            sums = self._sums(self.by_fold, sensitivities, amplitudes, folds)
-            self.solved[key] = sums.sum(axis=2), amplitudes
+            if len(known):
+                found = np.ascontiguousarray(found[..., np.argsort(order)])
+            self._keep(sensitivities, found)
         return self.solved[key]
+
+    def _keep(self, sensitivities: np.ndarray, amplitudes: np.ndarray) -> None:
+        """Keep amplitudes (L, r, folds, k) of sensitivities and what they leave."""
+        levels, ridges, folds, count = amplitudes.shape
+        together = amplitudes.swapaxes(0, 1).reshape(1, ridges, levels * folds, count)
+        each = np.arange(levels * folds)
+        sums = self._sums(self.by_fold, sensitivities, together, each)
+        sums = sums.reshape(ridges, levels, folds).swapaxes(0, 1)
+        self.solved[sensitivities.tobytes()] = sums.sum(axis=2), amplitudes
 
     def _factors(self, common: np.ndarray) -> np.ndarray:
         """(L, folds, r, c, c + 1) factors of the normal matrices of c sensitivities."""
@@ -481,6 +544,12 @@ class HeldOut:
                 pair = _pair(self.first, self.further, level, columns[i], columns[j])
                 answer[i, j] = answer[j, i] = pair
         return answer
+
+
+def _side_by_side(products: np.ndarray) -> np.ndarray:
+    """(1, ..., L F) products (L, ..., F) of L levels and F folds, level by level."""
+    moved = np.moveaxis(products, 0, -2)
+    return moved.reshape(1, *moved.shape[:-2], -1)
 
 
 def _rising(chosen: Sequence[int] | np.ndarray) -> np.ndarray:
@@ -701,11 +770,11 @@ def _solve(grams, rows, ridges, known, kept, amplitudes):
     for level in range(levels):
         for number in range(folds):
             gram = grams[level, number]
-            most = 1e-30
+            most = FAINTEST
             for i in range(count):
                 most = max(most, gram[rows[i + 1], rows[i + 1]])
             for i in range(count):
-                size[i] = np.sqrt(max(gram[rows[i + 1], rows[i + 1]], 1e-12 * most))
+                size[i] = np.sqrt(max(gram[rows[i + 1], rows[i + 1]], FAINT * most))
             for i in range(common, count):
                 for j in range(i + 1):
                     one, other = rows[i + 1], rows[j + 1]

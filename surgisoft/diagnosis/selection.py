@@ -343,11 +343,11 @@ class ModelSelection:
         together = {s.effect: s.option.chosen for s in scores}
         everything = self.losses(sum(together.values(), ()))
         total = self.explainable(self.losses(), [everything, *(s.losses for s in scores)])
-        answer = {}
-        for name in together:
-            rest = sum((chosen for other, chosen in together.items() if other != name), ())
-            answer[name] = float((self.losses(rest).sum() - everything.sum()) / total)
-        return answer
+        rests = self.validation.losses_without_each(list(together.values()))
+        return {
+            name: float((rest.sum() - everything.sum()) / total)
+            for name, rest in zip(together, rests, strict=True)
+        }
 
     def in_best_form(self, score: Score, base: tuple[int, ...] = ()) -> Effect | None:
         """An effect in its best single candidate, at its amplitudes beside a base."""

@@ -102,6 +102,30 @@ def test_what_sets_have_in_common_is_factorised_once(monkeypatch, data, common):
     assert found.amplitudes([2, 0, 1]) == pytest.approx(plain, rel=1e-9)
 
 
+@pytest.mark.parametrize("faint", [False, True])
+def test_losses_without_each_group_are_those_of_joint_fits(data, faint):
+    """Each of two groups left out; with a column next to nothing, too, which no ridge scales."""
+    features, residual, columns, *rest = data
+    columns = columns * np.array([1.0, 1.0, 1e-9 if faint else 1.0])
+    some = features, residual, columns, *rest
+    surrogate, noise = np.array([0.3, 0.5]), np.array([0.1, 0.1])
+    found = cross_validated(*some, surrogate, noise).losses_without_each([(2, 0), (1,)])
+    for left, picked, shares in zip(found, [[1], [0, 2]], [RIDGES[:1], RIDGES], strict=True):
+        if faint and 2 in picked:
+            picked = [0]  # the other one explains nothing
+        tried = [
+            brute(some, picked, rows, share, surrogate, noise)
+            for rows in PERSISTENCE
+            for share in shares
+        ]
+        assert left == pytest.approx(min(tried, key=np.sum), rel=2e-4)
+
+
+def test_leaving_out_the_only_group_leaves_nothing(data):
+    found = cross_validated(*data, np.array([0.3, 0.5]), np.array([0.1, 0.1]))
+    assert found.losses_without_each([(0, 1)])[0] == pytest.approx(found.losses([]), rel=1e-12)
+
+
 def test_losses_of_collinear_columns_are_those_of_joint_fits(data):
     """Columns that share most of their power, and the last one of which is weak."""
     features, residual, columns, *rest = data

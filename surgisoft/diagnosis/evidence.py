@@ -384,15 +384,13 @@ def collinearity(selection: ModelSelection, best: Score, other: Score) -> float:
     key points, on the other effect's sensitivities. What the model discrepancy could imitate of
     both counts too: a large value means that the two are hard to tell apart, no more.
     """
-    seen = np.isfinite(selection.problem.residual)
     own = list(best.option.chosen)
     change = selection.explained_mm(own, selection.validation.amplitudes(own))
-    design = selection.sensitivities(other.option.chosen)[seen].astype(float)
-    target = change[seen]
-    gram = design.T @ design
+    target = change[np.isfinite(selection.problem.residual)]
+    gram, moment = selection.products(other.option.chosen, change)
     ridge = COLLINEAR_RIDGE * np.trace(gram) / len(gram) * np.eye(len(gram))
-    moment = design.T @ target
-    return _share(moment @ np.linalg.solve(gram + ridge, moment), max(target @ target, 1e-30))
+    explained = float(moment @ np.linalg.solve(gram + ridge, moment))
+    return _share(explained, max(float(target @ target), 1e-30))
 
 
 def _proposal(found: Findings, place: int, free: np.ndarray) -> ProposalEvidence:

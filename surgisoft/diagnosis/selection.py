@@ -26,6 +26,9 @@ from surgisoft.diagnosis.statistics import (
 from surgisoft.diagnosis.testability import cubics
 from surgisoft.surrogate.effects import Effect, Quantity, hypothesis_of
 
+AT_ONCE = 64
+"""Rows of all sensitivities that are multiplied at once, so that they stay in the cache."""
+
 
 @dataclass(frozen=True, eq=False)
 class Option:
@@ -161,12 +164,44 @@ class ModelSelection:
         return np.result_type(np.float32, *kinds)
 
     def sensitivities(self, chosen: Sequence[int]) -> np.ndarray:
-        """(S, n, 3, k) some sensitivities, mm, in the candidates' precision."""
+        """(S, n, 3, k) some sensitivities, mm, in the candidates' precision.
+
+        Those of one candidate are its own array, not to be written to.
+        """
+        places = [self._place[one] for one in chosen]
+        if places:
+            whole = self.candidates[places[0][0]].sensitivities
+            every = [(places[0][0], own) for own in range(whole.shape[3])]
+            if places == every and whole.dtype == self._precision:
+                return whole
         answer = np.empty((len(chosen), *self.problem.residual.shape), self._precision)
-        for place, one in enumerate(chosen):
-            number, own = self._place[one]
+        for place, (number, own) in enumerate(places):
             answer[place] = self.candidates[number].sensitivities[..., own]
         return np.moveaxis(answer, 0, -1)
+
+    def products(self, chosen: Sequence[int], field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """((k, k), (k,)) products of some sensitivities with each other and with a field (S, n, 3),
+        over what was measured, in double precision; mm^2 for a field in mm."""
+        seen, count = np.isfinite(self.problem.residual), len(chosen)
+        owners: dict[int, tuple[list[int], list[int]]] = {}
+        for place, one in enumerate(chosen):
+            number, own = self._place[one]
+            places, columns = owners.setdefault(number, ([], []))
+            places.append(place)
+            columns.append(own)
+        gram, moment = np.zeros((count, count)), np.zeros(count)
+        for first in range(0, len(seen), AT_ONCE):
+            rows = slice(first, first + AT_ONCE)
+            some = np.empty((count, *seen[rows].shape))
+            for number, (places, columns) in owners.items():
+                of = self.candidates[number].sensitivities[rows]
+                every = columns == list(range(of.shape[3]))
+                some[places] = np.moveaxis(of if every else of[..., columns], 3, 0)
+            some *= seen[rows]
+            flat = some.reshape(count, -1)
+            gram += flat @ flat.T
+            moment += flat @ field[rows].reshape(-1)
+        return gram, moment
 
     def explained_mm(self, chosen: Sequence[int], amplitudes: np.ndarray) -> np.ndarray:
         """(S, n, 3) what some sensitivities explain at amplitudes (k,), mm."""

@@ -191,6 +191,26 @@ def test_no_share_of_what_can_be_explained_is_above_one():
     assert max(found.unique_gains(found.scores()).values()) <= 1.0
 
 
+def test_products_are_those_of_the_measured_numbers():
+    """Of sensitivities of two candidates out of order, against sums over one column after another;
+    more rows than are multiplied at once, and key points are missing."""
+    rng = np.random.default_rng(0)
+    residual = rng.normal(size=(selection.AT_ONCE + 30, 2, 3))
+    residual[3, 1] = residual[-4:, 0] = np.nan
+    field = rng.normal(size=residual.shape)
+    both = [rng.normal(size=(*residual.shape, count)) for count in (2, 3)]
+    given = [SimpleNamespace(sensitivities=each) for each in both]
+    problem = SimpleNamespace(residual=residual)
+    found = ModelSelection(problem, given, None, {}, np.ones(1))
+    columns = [both[1][..., 2], both[0][..., 0], both[0][..., 1]]
+    seen = ~np.isnan(residual)
+    gram, moment = found.products((4, 0, 1), field)
+    expected = [[(one * other)[seen].sum() for other in columns] for one in columns]
+    np.testing.assert_allclose(gram, expected, rtol=1e-12, atol=1e-10)
+    expected = [(one * field)[seen].sum() for one in columns]
+    np.testing.assert_allclose(moment, expected, rtol=1e-12, atol=1e-10)
+
+
 def test_two_effects_of_a_robot_are_proposed_together():
     rig = VirtualRig(0, take=3, hidden=(("creep", 1.2), ("payload", 1.2)))
     recording, _ = rig.record(make_protocol("mixed", rig.limits, 3000, seed=3))

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
+from surgisoft.compiled import compiled
 from surgisoft.diagnosis.history_features import Memory, memory_of
 from surgisoft.diagnosis.residuals import (
     FOLDS,
@@ -24,6 +24,7 @@ from surgisoft.diagnosis.residuals import (
     Problem,
     Reference,
     ResidualTable,
+    agree,
     half_range,
     model_discrepancy,
     motion_states,
@@ -39,8 +40,6 @@ KNOWN_ROWS = 6000
 KNOWN_BLOCK_S = 15.0
 """Length of the blocks of time of BEFORE that are held out together, s: three times those of an
 identification, since slow memories connect neighbours."""
-ASKED_AT_ONCE = 200
-"""Rows whose neighbours are sought at once: each may have KNOWN_ROWS of them."""
 KNOWN_PENALTIES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 """Ridge penalties that are tried, as shares of the number of rows; the last one leaves nothing."""
 
@@ -171,14 +170,22 @@ def _first_blocks(
     what is known of the motions of AFTER. Rows with the same actuation and the same past
     (`residuals.MOTION_ALIKE`) are held out together.
     """
-    points = state[rows]
-    tree = cKDTree(points)
-    # In parts: each of the rows at rest has all others for neighbours.
-    parts = np.array_split(points, -(-len(points) // ASKED_AT_ONCE))
-    near = (tree.query_ball_point(part, MOTION_ALIKE, p=np.inf) for part in parts)
-    first = rows[[min(some) for part in near for some in part]]
+    first = rows[_first_alike(np.ascontiguousarray(state[rows]), MOTION_ALIKE)]
     part = run[first] * 1e6 + t_s[first] // KNOWN_BLOCK_S
     return np.unique(part, return_inverse=True)[1]
+
+
+@compiled
+def _first_alike(points, near):
+    """(R,) for each row of points (R, k) the first one that differs from it by at most `near` in
+    every column."""
+    answer = np.arange(len(points))
+    for row in range(len(points)):
+        for other in range(row):
+            if agree(points, row, other, near):
+                answer[row] = other
+                break
+    return answer
 
 
 def _inputs(memory: Memory, spec: ArmSpec, rows: np.ndarray | slice = slice(None)) -> np.ndarray:

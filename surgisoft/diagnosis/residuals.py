@@ -19,6 +19,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from surgisoft.compiled import compiled
 from surgisoft.diagnosis.body_frame import bending, frames
 from surgisoft.diagnosis.history_features import Memory, features, memory_of
 from surgisoft.errors import InputError
@@ -824,9 +825,7 @@ def motions(history: History, half: np.ndarray, block: np.ndarray) -> np.ndarray
     # Which rows have a row of which block within reach: each block counts once for a row.
     near = np.zeros((len(owner), count), bool)
     near[np.arange(len(owner)), owner] = True
-    first, second = cKDTree(state).query_pairs(MOTION_ALIKE, p=np.inf, output_type="ndarray").T
-    near[first, owner[second]] = True
-    near[second, owner[first]] = True
+    _reach(np.ascontiguousarray(state), owner, MOTION_ALIKE, near)
     place, other = np.nonzero(near)
     shared = np.bincount(owner[place] * count + other, minlength=count * count).astype(float)
     shared = shared.reshape(count, count) / whole[:, None]
@@ -838,6 +837,28 @@ def motions(history: History, half: np.ndarray, block: np.ndarray) -> np.ndarray
             answer[first] = found
             found += 1
     return answer
+
+
+@compiled(inner=True)
+def agree(points, one, other, most):
+    """Whether two rows of points (N, k) differ by at most `most` in every column."""
+    for column in range(points.shape[1]):
+        if abs(points[one, column] - points[other, column]) > most:
+            return False
+    return True
+
+
+@compiled
+def _reach(state, owner, most, near):
+    """Set near (N, B) where a row has a row of a block within reach: one of state (N, k) that
+    differs by at most `most` in every column. owner: (N,) block of each row."""
+    for row in range(len(state)):
+        for other in range(row):
+            if near[row, owner[other]] and near[other, owner[row]]:
+                continue
+            if agree(state, row, other, most):
+                near[row, owner[other]] = True
+                near[other, owner[row]] = True
 
 
 def motion_states(history: History, half: np.ndarray) -> np.ndarray:

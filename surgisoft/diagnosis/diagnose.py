@@ -23,9 +23,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from surgisoft.diagnosis.black_box import black_box
-from surgisoft.diagnosis.candidates import candidates
+from surgisoft.diagnosis.candidates import Candidate, candidates
 from surgisoft.diagnosis.criteria import SEARCH
 from surgisoft.diagnosis.data_quality import (
     alarm_hints,
@@ -442,8 +443,11 @@ def diagnose(
     if both is not None:
         result = diagnose_change(problem, both, report, without)
     else:
-        found, not_testable = findings_of(problem, report, without)
+        report("sensitivities of the effects")
+        tried = tried_on(problem, without)
+        found, not_testable = findings_of(problem, report, without, tried)
         result = replace(result_of(found), not_testable=not_testable)
+        del found  # hundreds of MB
         if not reason and refit == "auto" and model.trainable:
             reason = reason_of_result(result.verdict)
         if reason:
@@ -456,7 +460,7 @@ def diagnose(
             result = with_axis(result, problem)
         if reference is None and not problem.in_fit and faster_than_fit(model.spec, whole):
             report("what has changed since the fit")
-            changed = changed_since_fit(table, without)
+            changed = changed_since_fit(table, without, (problem, tried))
             result = replace(result, since_fit=changed)
             notes = notes if changed else (*notes, NO_PAST)
     if result.next_command.startswith("surgisoft amend"):
@@ -476,19 +480,27 @@ def reason_of_result(verdict: Verdict) -> str:
     return "the network has learned part of what is missing" if learned else ""
 
 
-def changed_since_fit(table: ResidualTable, without: Collection[str] = ()) -> Verdict | None:
+def changed_since_fit(
+    table: ResidualTable,
+    without: Collection[str] = (),
+    known: tuple[Problem, list[Candidate]] | None = None,
+) -> Verdict | None:
     """What has changed since a model was fitted, by the rows that it keeps of its fit.
 
     A model may lack an effect of speed from the start that the slower motion of its fit hardly
     shows. What it got wrong then is subtracted (`known_error`). None where the model does not keep
-    what came before these rows.
+    what came before these rows. known: a problem of the same table and `tried_on` it, which is the
+    same for the same rows.
     """
     kept = table.model.training_residuals
-    known = None if kept is None else rows_of_fit(kept, table.spec)
-    if known is None:
+    fitted = None if kept is None else rows_of_fit(kept, table.spec)
+    if fitted is None:
         return None
-    problem = known_error(table, known).problem_of(table)
-    found, _ = findings_of(problem, lambda text: None, without)
+    problem = known_error(table, fitted).problem_of(table)
+    tried = None
+    if known is not None and torch.equal(known[0].index, problem.index):
+        tried = known[1]
+    found, _ = findings_of(problem, lambda text: None, without, tried)
     evidence = evidence_of(found)
     decision = of_change(decide(evidence), evidence)
     result = with_less(result_of(found, decision, evidence), found)
@@ -528,18 +540,35 @@ def amend_command(result: Diagnosis, unknown: bool) -> str:
     return command.replace("{data}", "OTHER_REC")
 
 
-def findings_of(
-    problem: Problem, report: Progress, without: Collection[str]
-) -> tuple[Findings, tuple[NotTestable, ...]]:
-    """Findings of model selection on an identification problem, and effects it cannot show."""
-    report("sensitivities of the effects")
+def tried_on(problem: Problem, without: Collection[str]) -> list[Candidate]:
+    """The candidates of all effects but some, on the rows of a problem."""
+    return candidates(problem, asked_for(without))
+
+
+def asked_for(without: Collection[str]) -> list[str]:
+    """The known effects but some."""
     names = known_effects()
     for name in without:
         if name not in names:
             raise unknown_name("effect", name, names)
-    asked = [name for name in names if name not in without]
-    tried, not_testable = testable(problem, candidates(problem, asked), asked)
-    return find(problem, tried, report), not_testable
+    return [name for name in names if name not in without]
+
+
+def findings_of(
+    problem: Problem,
+    report: Progress,
+    without: Collection[str],
+    tried: list[Candidate] | None = None,
+) -> tuple[Findings, tuple[NotTestable, ...]]:
+    """Findings of model selection on an identification problem, and effects it cannot show.
+
+    tried: the candidates, where they are known (`tried_on`).
+    """
+    if tried is None:
+        report("sensitivities of the effects")
+        tried = tried_on(problem, without)
+    shown, not_testable = testable(problem, tried, asked_for(without))
+    return find(problem, shown, report), not_testable
 
 
 def since(result: Diagnosis, both: BeforeAfter, found: Findings) -> Diagnosis:

@@ -17,6 +17,7 @@ from surgisoft.diagnosis.diagnose import (
     Diagnosis,
     ErrorLevels,
     Verdict,
+    changed_since_fit,
     diagnose,
     lacking_before,
     since,
@@ -36,7 +37,12 @@ from surgisoft.diagnosis.pairs import (
     slope_error,
     without_noise,
 )
-from surgisoft.diagnosis.residuals import LEAST_DISCREPANCY, model_discrepancy, residual_table
+from surgisoft.diagnosis.residuals import (
+    LEAST_DISCREPANCY,
+    Sealed,
+    model_discrepancy,
+    residual_table,
+)
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import history_of, speed_of
 from surgisoft.measurement.protocols import make_protocol
@@ -847,6 +853,8 @@ def test_faster_motion_than_in_the_fit_tells_what_has_changed_since(model, chang
     assert since.sentence.startswith("since the fit of the model: ")
     assert found.verdict.kind != "nothing_missing"
     assert (since.kind == "nothing_missing") != changed
+    # The candidates are those of the diagnosis before: alone, it gives the same.
+    assert changed_since_fit(residual_table(arm, Sealed([new]).training)) == since
     assert diagnose(arm, [old], refit="never").since_fit is None, "as fast as in the fit"
     assert not any("--before" in note for note in found.notes)
     arm.training_residuals = replace(arm.training_residuals, past=None)

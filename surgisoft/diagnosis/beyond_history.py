@@ -120,8 +120,9 @@ def _best_moment(
     """
     rows, size = len(sensitivities), sensitivities.shape[3]
     behind = [np.arange(rows) >= int(place * rows) for place in places]
-    parts = [sensitivities * each[:, None, None, None] for each in behind]
-    validation = CrossValidation.on(split, np.concatenate(parts, axis=3))
+    single = sensitivities.astype(np.float32)  # as the cross-validation keeps them
+    parts = [single * each[:, None, None, None] for each in behind]
+    validation = CrossValidation.on(split, parts)
     losses = [validation.losses(range(n * size, (n + 1) * size)) for n in range(len(places))]
     best = int(np.argmin([each.sum() for each in losses]))
     return float(places[best]), losses[best]

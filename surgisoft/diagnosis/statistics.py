@@ -178,7 +178,6 @@ def cross_validated_ridge(
     rows is taken, the same for all targets and folds.
     """
     x = _standardised(design)
-    x = np.concatenate([np.ones((len(x), 1)), x], axis=1)
     error = np.zeros(len(penalties))
     fits = []
     for columns in _alike(target):
@@ -201,12 +200,17 @@ def cross_validated_ridge(
 
 
 def _standardised(design: np.ndarray) -> np.ndarray:
-    """(S, F') columns of mean 0 and variance 1; constant ones are left out."""
-    centred = design - design.mean(axis=0)
+    """(S, 1 + F') a column of ones, and columns of mean 0 and variance 1 but constant ones."""
+    answer = np.empty((len(design), 1 + design.shape[1]))
+    answer[:, 0] = 1.0
+    centred = np.subtract(design, design.mean(axis=0), out=answer[:, 1:])
     spread = np.sqrt(np.einsum("sf,sf->f", centred, centred) / len(design))
     largest = np.maximum(design.max(axis=0, initial=0), -design.min(axis=0, initial=0))
     kept = spread > 1e-9 * np.maximum(largest, 1e-300)
-    return centred[:, kept] / spread[kept]
+    if not kept.all():
+        answer = np.compress(np.append(True, kept), answer, axis=1)
+    answer[:, 1:] /= spread[kept]
+    return answer
 
 
 def _alike(target: np.ndarray) -> list[np.ndarray]:

@@ -8,7 +8,7 @@ proposed, generously: whether any of them is missing is left to the fitted decis
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import combinations
+from itertools import combinations, groupby
 
 import numpy as np
 
@@ -157,27 +157,16 @@ class ModelSelection:
         counts = [each.sensitivities.shape[3] for each in self.candidates]
         return [(number, own) for number, count in enumerate(counts) for own in range(count)]
 
-    @cached_property
-    def _precision(self) -> np.dtype:
-        """The precision that holds all candidates."""
-        kinds = (each.sensitivities.dtype for each in self.candidates)
-        return np.result_type(np.float32, *kinds)
-
-    def sensitivities(self, chosen: Sequence[int]) -> np.ndarray:
-        """(S, n, 3, k) some sensitivities, mm, in the candidates' precision.
-
-        Those of one candidate are its own array, not to be written to.
-        """
-        places = [self._place[one] for one in chosen]
-        if places:
-            whole = self.candidates[places[0][0]].sensitivities
-            every = [(places[0][0], own) for own in range(whole.shape[3])]
-            if places == every and whole.dtype == self._precision:
-                return whole
-        answer = np.empty((len(chosen), *self.problem.residual.shape), self._precision)
-        for place, (number, own) in enumerate(places):
-            answer[place] = self.candidates[number].sensitivities[..., own]
-        return np.moveaxis(answer, 0, -1)
+    def parts(self, chosen: Sequence[int]) -> list[np.ndarray]:
+        """(S, n, 3, k) each: some sensitivities one after another, mm; those of a candidate that
+        follow each other are views of its own."""
+        places, answer = [self._place[one] for one in chosen], []
+        for number, group in groupby(places, key=lambda place: place[0]):
+            own = [place for _, place in group]
+            of = self.candidates[number].sensitivities
+            together = own == list(range(own[0], own[-1] + 1))
+            answer.append(of[..., own[0] : own[-1] + 1] if together else of[..., own])
+        return answer
 
     def products(self, chosen: Sequence[int], field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """((k, k), (k,)) products of some sensitivities with each other and with a field (S, n, 3),
@@ -458,7 +447,7 @@ def beside_relaxed(selection: ModelSelection, named: Sequence[Score], further: S
     """
     chosen = further.option.chosen
     sensitivities = _relaxed_sensitivities(selection, named, _by_state)
-    sensitivities.append(selection.sensitivities(chosen))
+    sensitivities += selection.parts(chosen)
     validation = CrossValidation.on(selection.validation.split, sensitivities)
     total = validation.sensitivities
     before, after = (validation.losses(range(n)) for n in (total - len(chosen), total))
@@ -474,7 +463,7 @@ def _relaxed_sensitivities(
     choices = [selection.freest(score) for score in named]
     base = sum(choices, ())
     amplitudes = selection.validation.amplitudes(base)
-    sensitivities, first = [selection.sensitivities(base)], 0
+    sensitivities, first = selection.parts(base), 0
     for chosen in choices:
         part = selection.explained_mm(chosen, amplitudes[first : first + len(chosen)])
         sensitivities.append(scaled(selection, part))

@@ -53,6 +53,9 @@ GROWTHS = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0)
 """Growths of the score's scale by distance that are tried, per range of a chamber."""
 NEAREST = 0.05
 """Share of the scored rows below whose distance the scale is not extrapolated."""
+FURTHER = 0.1
+"""Distance beyond the nearest scored rows of which the radii are told, too, where they grow, in
+ranges of a chamber."""
 LEAST_GAIN = 0.05
 """Least fall of the mean radius that a growth has to bring where groups are too few for a test, as
 a share of the radius without."""
@@ -133,23 +136,31 @@ class ErrorInterval:
         return asdict(self)
 
     def sentence(self) -> str:
-        """The interval on a row like those of the training, in one line."""
-        least = self.radius_mm(torch.tensor(0.0, dtype=torch.float64)).tolist()
-        radii = " ".join(f"{value:.2f}" for value in least)
+        """The interval on a row like those of the training, in one line.
+
+        Where it widens with the distance, also that at `FURTHER` beyond such rows.
+        """
         beyond = ""
         if any(self.growth):
-            each = self.growth[:1] if len(set(self.growth)) == 1 else self.growth
-            growth = " ".join(f"{value:g}" for value in each)
-            beyond = f"; wider by {growth} x distance to the training data"
+            further = self.nearest + FURTHER
+            beyond = (
+                f", and within {self._radii(further)} mm where the actuation is {further:.0%} of a "
+                "chamber's range away from all of the training data"
+            )
         few = f"; fewer than {EXACT_GROUPS}, so their RMS errors are taken to be log-normal"
         if self.groups < LEAST_GROUPS:
             few = "; too few to know how much groups differ"
         few *= self.groups < EXACT_GROUPS
         return (
-            f"{LEVEL:.0%} of the key points of a further run are within (base to tip) {radii} mm "
-            f"of the prediction ({self.source}, {self.rows} rows in {self.groups} "
-            f"groups{few}{beyond})"
+            f"{LEVEL:.0%} of the key points of a further run are within (base to tip) "
+            f"{self._radii(self.nearest)} mm of the prediction{beyond} ({self.source}, {self.rows} "
+            f"rows in {self.groups} groups{few})"
         )
+
+    def _radii(self, distance: float) -> str:
+        """Radii in mm, base to tip, at a distance in ranges of a chamber."""
+        radii = self.radius_mm(torch.tensor(distance, dtype=torch.float64)).tolist()
+        return " ".join(f"{value:.2f}" for value in radii)
 
 
 def distance_to(actuation: Tensor, reference: Tensor, span: Tensor) -> Tensor:

@@ -266,14 +266,25 @@ INTERVAL = ErrorInterval(
 @pytest.mark.parametrize(
     ("groups", "said"),
     [
-        (3, "3 groups; too few to know how much groups differ; wider"),
-        (18, "18 groups; fewer than 19, so their RMS errors are taken to be log-normal; wider"),
-        (19, "19 groups; wider"),
+        (3, "3 groups; too few to know how much groups differ)"),
+        (18, "18 groups; fewer than 19, so their RMS errors are taken to be log-normal)"),
+        (19, "19 groups)"),
     ],
 )
 def test_the_interval_says_what_few_groups_leave_open(groups, said):
     """Of K exchangeable groups and one further one, that one is the worst with 1 / (K + 1)."""
     assert said in replace(INTERVAL, groups=groups).sentence()
+
+
+def test_the_sentence_says_in_millimetres_how_much_wider_the_interval_gets():
+    """Scored rows were 2 % of a range away from the training; the second radius of 1 mm there grows
+    by 100 for each range: (1 + 100 x 0.12) / (1 + 100 x 0.02) = 4.33 mm at 12 %."""
+    quantile = 1.0 / 3.0
+    found = ErrorInterval((LEVEL,), ((0.25, quantile),), (0.0, 100.0), 900, 30, "s", nearest=0.02)
+    said = found.sentence()
+    assert "within (base to tip) 0.25 1.00 mm of the prediction, and within 0.25 4.33 mm " in said
+    assert "is 12% of a chamber's range away from all of the training data (s, 900 rows" in said
+    assert "away" not in replace(found, growth=(0.0, 0.0), nearest=0.0).sentence()
 
 
 def test_a_model_keeps_its_interval_in_its_folder(tmp_path):

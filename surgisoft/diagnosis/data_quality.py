@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 from surgisoft.diagnosis.residuals import Problem
 from surgisoft.measurement.recordings import AlarmInfo, Recording, after_alarm
 from surgisoft.measurement.recordings.clock import gaps_in_words
+from surgisoft.measurement.recordings.valves import changed_valves
 
 FAR_FROM_FIT = 2.0
 """An actuation is far from the fit where its distance from the nearest actuation of the fit exceeds
@@ -96,6 +97,22 @@ def gap_hints(recordings: Sequence[Recording]) -> tuple[str, ...]:
         for recording in recordings
         if (found := gaps_in_words(recording))
     )
+
+
+def valve_hints(
+    recordings: Sequence[Recording], before: Sequence[Recording], actuation: str
+) -> tuple[str, ...]:
+    """A sentence where valves follow their commands faster or slower than before, or none.
+
+    actuation: what drives the model, `measured` or `commanded`.
+    """
+    found = changed_valves(recordings, before)
+    if not found:
+        return ()
+    means = "the model is driven by measured actuation, which contains the delay"
+    if actuation == "commanded":
+        means = "the model is driven by commands, so the change is one of line_lag"
+    return (f"{found}: {means}",)
 
 
 def data_quality_warnings(problem: Problem) -> list[str]:

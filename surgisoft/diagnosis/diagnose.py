@@ -33,6 +33,7 @@ from surgisoft.diagnosis.data_quality import (
     data_quality_warnings,
     gap_hints,
     thinning_notes,
+    valve_hints,
 )
 from surgisoft.diagnosis.decision import (
     CLEAR_JUMPS,
@@ -423,8 +424,8 @@ def diagnose(
     if before is None and not isinstance(reference, TrainingResiduals | None):
         before = reference
     both = None
+    earlier = [] if before is None else load_recordings(before)
     if before is not None:
-        earlier = load_recordings(before)
         refuse_amended(model, whole, earlier)
         both = before_and_after(table, earlier, paired)
         problem = both.training()
@@ -466,7 +467,8 @@ def diagnose(
     if result.next_command.startswith("surgisoft amend"):
         unknown = not held_out_in_fit(model, whole, table.held_out)
         result = replace(result, next_command=amend_command(result, unknown))
-    checks = (*alarm_hints(whole, recordings), *gap_hints(whole), *result.checks)
+    valves = valve_hints(whole, earlier, model.spec.actuation)
+    checks = (*alarm_hints(whole, recordings), *gap_hints(whole), *valves, *result.checks)
     return replace(result, checks=checks, notes=notes, seconds=time.perf_counter() - begin)
 
 

@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings.valves import valve_words
 
 LEAST_FROZEN_ROWS = 20
 """Shorter repeats are never called frozen."""
@@ -454,6 +455,8 @@ def summary(recording: Recording) -> list[str]:
     ]
     if recording.commanded is not None:
         lines.append(f"  commanded {unit}: {_ranges(recording.commanded)}")
+        if lags := valve_words(recording):
+            lines.append(f"  {lags}")
     lines += [_key_point(recording, j) for j in range(recording.key_points)]
     for name in ("temp_C", "payload_g"):
         values = getattr(recording, name)

@@ -1,5 +1,8 @@
 """Units that raw files come in, and conversion between units of one quantity."""
 
+import itertools
+import math
+
 from surgisoft.config import Where
 from surgisoft.measurement.recordings.columns import MM_PER
 from surgisoft.surrogate.units import KPA_PER
@@ -77,3 +80,25 @@ def other_units(unit: str) -> dict[str, float]:
                 if name != unit and name not in _SELDOM
             }
     return {}
+
+
+def unit_mistakes(unit: str) -> dict[tuple[str, str], float]:
+    """What values that are stated in `unit` have to be multiplied by, for each wrong reading.
+
+    Keys: the true unit of the values, and the unit that they were read as. Where the second is
+    `unit`, nothing was converted; elsewhere it was converted to `unit`. A factor that several pairs
+    have is listed once: with no conversion if possible, else with values that were right before.
+    """
+    of_unit = {unit: 1.0} | other_units(unit)
+    others = list(of_unit)[1:]
+    pairs = [
+        *((true, unit) for true in others),
+        *((unit, read) for read in others),
+        *itertools.permutations(others, 2),
+    ]
+    found: dict[tuple[str, str], float] = {}
+    for true, read in pairs:
+        by = of_unit[true] / of_unit[read]
+        if not any(math.isclose(by, known, rel_tol=1e-9) for known in (1.0, *found.values())):
+            found[true, read] = by
+    return found

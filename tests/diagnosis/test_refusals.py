@@ -232,6 +232,6 @@ STILL = Frame(np.eye(3), np.zeros(3), np.array(1.0))
     ],
 )  # fmt: skip
 def test_faults_of_a_set_up_are_named(given, frame, text):
-    faults = faults_of(given, frame, "kPa", "psi")
+    faults = faults_of(given, frame, "kPa", ("psi", "kPa"))
     assert text in joined(faults)
     assert [fault.kind for fault in faults] == list(given.kinds)

@@ -3,7 +3,7 @@
 import pytest
 
 from surgisoft.measurement.recordings.columns import MM_PER
-from surgisoft.measurement.units import SECONDS_PER, factor, same_unit, unit_named
+from surgisoft.measurement.units import SECONDS_PER, factor, same_unit, unit_mistakes, unit_named
 
 VALUES = [
     ("in", "mm", 25.4),
@@ -51,6 +51,22 @@ def test_a_unit_is_known_by_its_letters():
     assert unit_named("PSI") == "psi"
     assert unit_named("mn") == "mN"
     assert unit_named("count") is None
+
+
+@pytest.mark.parametrize("unit", ["kPa", "psi", "mm", "deg"])
+def test_every_pair_of_units_that_may_be_mistaken_is_listed_once(unit):
+    """Of Pa, kPa, MPa, mbar, bar and psi all ratios but 1: 10 to 1e6 and 6.895 times powers of ten,
+    both ways; of mm, cm, m and in 10, 100, 1000, 2.54, 25.4 and 39.37, both ways."""
+    known = {
+        "mm": ["mm", "cm", "m", "in"],
+        "deg": ["deg", "rad"],
+    }.get(unit, ["Pa", "kPa", "MPa", "mbar", "bar", "psi"])
+    expected = {f"{factor(a, b):.6g}" for a in known for b in known if a != b}
+    found = unit_mistakes(unit)
+    assert sorted(f"{by:.6g}" for by in found.values()) == sorted(expected)
+    for (true, read), by in found.items():
+        assert by == pytest.approx(factor(true, read), rel=1e-9)
+    assert all((other, unit) in found for other in known if other != unit)
 
 
 def test_units_of_one_quantity_differ_and_unknown_ones_contradict_nothing():

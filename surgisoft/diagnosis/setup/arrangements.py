@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
 from surgisoft.diagnosis.setup.sample import Arrangement, Sample
-from surgisoft.measurement.units import other_units
+from surgisoft.measurement.units import unit_mistakes
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.history import pack
 from surgisoft.surrogate.model import ArmModel
@@ -34,15 +34,15 @@ TURNS = 24
 """Steps of a turn about z in which frames are tried for the assignment."""
 
 
-def units(spec: ArmSpec, actuation: np.ndarray) -> dict[str, float]:
-    """Unit -> model units in it, for units that recorded actuation (N, m) may be in."""
+def mistaken(spec: ArmSpec, actuation: np.ndarray) -> dict[tuple[str, str], float]:
+    """The `unit_mistakes` that may have been made with recorded actuation (N, m), by its range."""
     largest = max(np.abs(spec.low).max(), np.abs(spec.high).max())
     reach, span = np.abs(actuation).max(), np.ptp(actuation, axis=0).max()
-    found = {spec.unit: 1.0}
-    for unit, factor in other_units(spec.unit).items():
+    found = {}
+    for mistake, factor in unit_mistakes(spec.unit).items():
         within = factor * reach <= BEYOND_RANGE * largest
         if within and factor * span >= LEAST_SPAN * max(spec.span):
-            found[unit] = factor
+            found[mistake] = factor
     return found
 
 

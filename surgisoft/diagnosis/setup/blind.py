@@ -60,12 +60,12 @@ class Blind:
     blocks: Moments
     """(B,) sums over each block of time."""
 
-    def further(self, unit: str, recorded: str) -> list[SetupFault]:
-        """The faults beside the dead channel."""
+    def further(self, unit: str, mistake: tuple[str, str]) -> list[SetupFault]:
+        """The faults beside the dead channel, as `faults_of` words them."""
         losses = np.zeros(len(self.blocks.count))
         late = 0.5 * TIME_STEP_S
         given = Fitted(self.hypothesis, self.frame, self.blocks, losses, self.rmse_mm, late)
-        return faults_of(given, self.frame, unit, recorded)
+        return faults_of(given, self.frame, unit, mistake)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,11 +135,10 @@ def _hypotheses(search: Search, channel: int) -> list[_Tried]:
         found.append(_Tried(replace(nothing, points=same[::-1]), as_it_is))
     for mm in LENGTHS[1:]:
         found.append(_Tried(replace(nothing, mm_per_unit=mm), replace(as_it_is, scale=1.0 / mm)))
-    for factor in search.factors:
-        if factor != 1.0:
-            found.append(
-                _Tried(replace(nothing, arrangement=replace(plain, factor=factor)), as_it_is)
-            )
+    for factor in search.factors[1:]:
+        scaled = replace(nothing, arrangement=replace(plain, factor=factor))
+        if not search.conversions(scaled):
+            found.append(_Tried(scaled, as_it_is))
     if chambers <= EXHAUSTIVE:
         orders = list(itertools.permutations(range(chambers)))
     else:

@@ -35,7 +35,8 @@ class Correction:
     unit: str
     """Unit of actuation that the model is in."""
     recorded_unit: str
-    """Unit of actuation that the recording is truly in."""
+    """Unit of actuation that the recording is truly in; the model's unit where no unit, but only
+    the factor of the arrangement corrects it."""
     mm_per_unit: float = 1.0
     """Millimetres in what the recording calls one."""
     rotation: np.ndarray | None = None
@@ -138,15 +139,17 @@ class Correction:
             time = {"column": "t_s"} | ({"unit": unit} if unit else {"scale": self.time_factor})
         measured: dict[str, Any] = {}
         moved = given.order != tuple(range(len(given.order)))
-        if moved or self.from_command or given.factor != 1.0:
+        another = self.recorded_unit != self.unit
+        if moved or self.from_command or another:
             # Columns that are found by their names have the unit that their names state.
             measured["columns"] = [
                 f"{'c' if k in self.from_command else 'p'}{k + 1}_{self.unit}" for k in given.order
             ]
             measured["unit"] = self.recorded_unit
-        if any(sign != 1.0 for sign in given.sign):
-            measured["scale"] = list(given.sign)
-        if given.factor != 1.0:
+        scale = given.sign if another else tuple(float(gain) for gain in given.gain)
+        if any(by != 1.0 for by in scale):
+            measured["scale"] = list(scale)
+        if another:
             measured["to"] = self.unit
         if self.delay_s:
             measured["delay_s"] = round(self.delay_s, 4)

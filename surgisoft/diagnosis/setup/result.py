@@ -9,7 +9,7 @@ import numpy as np
 from surgisoft.diagnosis.other_models import has_slope
 from surgisoft.diagnosis.residuals import EVERY_ROW, fit_of_model, model_discrepancy, noise_of
 from surgisoft.diagnosis.setup.alignment import HANDED, Frame, angle, shifted
-from surgisoft.diagnosis.setup.arrangements import units
+from surgisoft.diagnosis.setup.arrangements import mistaken
 from surgisoft.diagnosis.setup.blind import Blind, blind_channel
 from surgisoft.diagnosis.setup.channels import Dead, dead_channels
 from surgisoft.diagnosis.setup.correction import Correction
@@ -193,7 +193,7 @@ def _search(model: ArmModel, recordings: list[Recording], levels: Levels) -> Sea
     sizes = (SETTINGS.coarse_rows, SETTINGS.fine_rows, EVERY_ROW)
     coarse, fine, full = samples_of(model, recordings, sizes)
     actuation = np.concatenate([actuation_of(r, model.spec.actuation) for r in recordings])
-    return Search(coarse, fine, full, levels, units(model.spec, actuation))
+    return Search(coarse, fine, full, levels, mistaken(model.spec, actuation))
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +226,7 @@ class _Report:
         if self.found:
             faults += self._faults(best, frame)
         elif self.blind:
-            faults += self.blind.further(self._unit, self._recorded(given))
+            faults += self.blind.further(self._unit, self._mistake(given))
         other_time = self._time_unit()
         faults = [*other_time, *faults]
         if not faults:
@@ -283,13 +283,13 @@ class _Report:
         """Whether every recording has a command."""
         return all(recording.commanded is not None for recording in self.recordings)
 
-    def _recorded(self, given: Hypothesis) -> str:
-        """The unit that the actuation is truly in."""
-        names = {factor: unit for unit, factor in self.search.units.items()}
-        return names.get(given.arrangement.factor, self._unit)
+    def _mistake(self, given: Hypothesis) -> tuple[str, str]:
+        """The unit that the actuation is truly in, and the one that it was read as."""
+        names = {factor: mistake for mistake, factor in self.search.mistakes.items()}
+        return names.get(given.arrangement.factor, (self._unit, self._unit))
 
     def _faults(self, given: Fitted, frame: Frame) -> list[SetupFault]:
-        return faults_of(given, frame, self._unit, self._recorded(given.hypothesis))
+        return faults_of(given, frame, self._unit, self._mistake(given.hypothesis))
 
     def _time_unit(self) -> list[SetupFault]:
         """The fault that times are in another unit, where that is so."""
@@ -320,11 +320,12 @@ class _Report:
         rotation = np.round(rotation) + 0.0 if exact else rotation
         identity = np.array_equal(rotation, np.eye(3))
         shift = np.asarray(frame.shift) * given.mm_per_unit
+        true, read = self._mistake(given)
         return Correction(
             arrangement=given.arrangement,
             points=given.points,
             unit=self._unit,
-            recorded_unit=self._recorded(given),
+            recorded_unit=true if read == self._unit else self._unit,
             mm_per_unit=given.mm_per_unit,
             rotation=rotation if turned and not identity else None,
             origin_mm=shift if turned and shift.any() else None,

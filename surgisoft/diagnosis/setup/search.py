@@ -35,6 +35,7 @@ from surgisoft.diagnosis.setup.sample import (
     neighbours,
 )
 from surgisoft.measurement.recordings.clock import follows_motion, impossible, time_factors
+from surgisoft.measurement.units import unit_mistakes
 from surgisoft.surrogate.effects.misalignment import Misalignment
 from surgisoft.surrogate.model import ArmModel
 
@@ -49,9 +50,10 @@ KINDS: tuple[Kind, ...] = (
     "time",
 )
 
-LENGTHS = (1.0, 10.0, 1000.0, 25.4, 0.1, 0.001, 1 / 25.4, 100.0, 0.01)
-"""Millimetres in a recorded unit that are tried: cm, m, inch for mm, each the other way round, and
-m for cm."""
+LENGTH_MISTAKES = unit_mistakes("mm")
+"""Millimetres in what the recording calls one, by the true unit and the one it was read as."""
+LENGTHS = (1.0, *LENGTH_MISTAKES.values())
+"""Millimetres in a recorded unit that are tried."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,10 @@ class Proof:
     lag_gain: float = 0.5
     """Most squared error above the validated one that a pure delay may leave, as a share of what
     the best lag without a delay leaves."""
+    apart: float = 1.45
+    """Factor by which another scale has to leave a larger error, where a unit was converted that
+    was wrong: the ratio of the two scales of such mistakes that are nearest to each other (10, and
+    6.89 of psi). A scale that is not exactly that of a mistake is a gain."""
     earliest_s: float = 0.03
     """Least offset of the clocks that is called a fault, s; or one and a half rows."""
     most_kinds: int = 3
@@ -259,14 +265,14 @@ class Search:
         fine: Sample,
         full: Sample,
         levels: Levels,
-        units: dict[str, float],
+        mistakes: dict[tuple[str, str], float],
         settings: SearchSettings = SETTINGS,
         proof: Proof = PROOF,
     ):
-        """units: unit -> model units in it, for the units of actuation that are tried."""
+        """mistakes: those with the unit of actuation that are tried (`unit_mistakes`)."""
         self.coarse, self.fine, self.full, self.levels = coarse, fine, full, levels
-        self.units, self.settings, self.proof = units, settings, proof
-        self.factors = tuple(units.values())
+        self.mistakes, self.settings, self.proof = mistakes, settings, proof
+        self.factors = (1.0, *mistakes.values())
         self.border = Border.of(coarse.model)
         self.chambers = coarse.history.chambers
         self._measured = fine.measured()[0]
@@ -280,7 +286,7 @@ class Search:
         coarse, fine, full = (
             each.with_time(factor) for each in (self.coarse, self.fine, self.full)
         )
-        other = Search(coarse, fine, full, self.levels, self.units, self.settings, self.proof)
+        other = Search(coarse, fine, full, self.levels, self.mistakes, self.settings, self.proof)
         other.time_factor = self.time_factor * factor
         return other
 
@@ -601,7 +607,20 @@ class Search:
         """The explanation with the fewest kinds among those that do as well as any."""
         limit = self._as_good(min(each.rmse_mm for each in tried))
         near = [each for each in tried if each.rmse_mm <= limit]
-        return min(near, key=lambda e: (e.complexity, e.hypothesis.arrangement.changes, e.rmse_mm))
+
+        def order(e: Fitted) -> tuple[int, int, int, float]:
+            changes = e.hypothesis.arrangement.changes
+            return e.complexity, changes, self.conversions(e.hypothesis), e.rmse_mm
+
+        return min(near, key=order)
+
+    def conversions(self, hypothesis: Hypothesis) -> int:
+        """Number of quantities that were read in a wrong unit and then converted."""
+        by, unit = hypothesis.arrangement.factor, self.coarse.model.spec.unit
+        read = [read for (_, read), factor in self.mistakes.items() if factor == by]
+        mm = hypothesis.mm_per_unit
+        read_mm = [read for (_, read), factor in LENGTH_MISTAKES.items() if factor == mm]
+        return sum(each != unit for each in read) + sum(each != "mm" for each in read_mm)
 
     def _as_good(self, least_mm: float) -> float:
         """Error up to which an explanation does as well as one that leaves `least_mm`, mm.
@@ -640,7 +659,23 @@ class Search:
         shown = np.abs(rms[1] - rms[0]) >= asked.changed * rms[0]
         falls = (rms[1] < rms[0])[shown]
         share = 1.0 if known else float(np.mean(falls)) if shown.any() else 0.0
-        return enough and after.rmse_mm <= most and share >= asked.blocks
+        if not (enough and after.rmse_mm <= most and share >= asked.blocks):
+            return False
+        return self.conversions(after.hypothesis) == 0 or self._exact_scale(after)
+
+    def _exact_scale(self, given: Fitted) -> bool:
+        """Whether neither a larger nor a smaller scale explains as much as that of a mistake."""
+        hypothesis, arrangement = given.hypothesis, given.hypothesis.arrangement
+        others = []
+        for by in (self.proof.apart, 1.0 / self.proof.apart):
+            if arrangement.factor != 1.0:
+                scaled = replace(arrangement, factor=by * arrangement.factor)
+                others.append(replace(hypothesis, arrangement=scaled))
+            if hypothesis.mm_per_unit != 1.0:
+                others.append(replace(hypothesis, mm_per_unit=by * hypothesis.mm_per_unit))
+        # Errors in recorded units: one in mm grows with the millimetres in a unit.
+        as_recorded = given.rmse_mm / hypothesis.mm_per_unit
+        return all(as_recorded < self.fit(other).rmse_mm / other.mm_per_unit for other in others)
 
     def _pure_delay(self, given: Fitted) -> bool:
         """Whether an offset in time is one of the clocks and no lag of the arm or its line.

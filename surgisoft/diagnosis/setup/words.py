@@ -9,15 +9,15 @@ from scipy.spatial.transform import Rotation
 
 from surgisoft.diagnosis.setup.alignment import Frame, angle
 from surgisoft.diagnosis.setup.sample import Arrangement
-from surgisoft.diagnosis.setup.search import Fitted, Kind
+from surgisoft.diagnosis.setup.search import LENGTH_MISTAKES, Fitted, Kind
 
 NEAR_AXIS_RAD = 0.1
 """An axis of rotation is named x, y or z up to this angle, rad."""
 LEAST_SHIFT_SD, LEAST_SHIFT_MM = 3.0, 0.5
 """Least shift of a turned frame that is reported as part of the fault: in standard errors, and in
 mm."""
-UNIT_NAMES = {10.0: "cm", 1000.0: "m", 25.4: "inches"}
-"""Names of units of length by their millimetres."""
+PLURAL = {"in": "inches"}
+"""Units in words, where these differ from their letters."""
 TIME_NAMES = {1e-3: "ms", 1e-6: "us"}
 """Names of units of time by their seconds."""
 
@@ -48,13 +48,16 @@ def signed_axes() -> np.ndarray:
     return np.array(found)
 
 
-def faults_of(given: Fitted, frame: Frame, unit: str, recorded_unit: str) -> list[SetupFault]:
-    """The faults of one explanation; frame: as it will be corrected."""
+def faults_of(given: Fitted, frame: Frame, unit: str, mistake: tuple[str, str]) -> list[SetupFault]:
+    """The faults of one explanation; frame: as it will be corrected; unit: of the model.
+
+    mistake: the true unit of the actuation, and the unit that it was read as.
+    """
     words = {
         "chambers": lambda: _chambers(given.hypothesis.arrangement),
         "actuation_unit": lambda: SetupFault(
             "actuation_unit",
-            f"the actuation is in {recorded_unit} where {unit} is stated",
+            _unit("the actuation is", given.hypothesis.arrangement.factor, mistake, unit, "is"),
             {"factor": given.hypothesis.arrangement.factor},
         ),
         "key_points": lambda: _key_points(given.hypothesis.points),
@@ -127,15 +130,24 @@ def _key_points(points: tuple[int, ...]) -> SetupFault:
 
 
 def _length(mm: float) -> SetupFault:
-    if mm in UNIT_NAMES:
-        text = f"the positions are in {UNIT_NAMES[mm]} where mm are stated"
-    elif 1.0 / mm in UNIT_NAMES:
-        text = f"the positions are {1 / mm:g} times too large: mm were read as {UNIT_NAMES[1 / mm]}"
-    elif mm < 1.0:
-        text = f"the positions are {1 / mm:g} times too large"
-    else:
-        text = f"the positions are {mm:g} times too small"
+    mistake = next((pair for pair, by in LENGTH_MISTAKES.items() if by == mm), None)
+    text = _unit("the positions are", mm, mistake, "mm", "are")
     return SetupFault("length_unit", text, {"mm_per_recorded_mm": mm})
+
+
+def _unit(what: str, factor: float, mistake: tuple[str, str] | None, unit: str, are: str) -> str:
+    """A wrong unit in words; unit: the stated one; factor: of it in what the recording calls one.
+
+    mistake: the true unit, and the one that the values were read as.
+    """
+    wrong = f"{1 / factor:.6g} times too large" if factor < 1.0 else f"{factor:.6g} times too small"
+    if mistake is None:
+        return f"{what} {wrong}"
+    true, read = (PLURAL.get(each, each) for each in mistake)
+    if mistake[1] == unit:
+        return f"{what} in {true} where {unit} {are} stated"
+    converted = "" if mistake[0] == unit else f" and converted to {unit}"
+    return f"{what} {wrong}: {true} were read as {read}{converted}"
 
 
 def _frame(given: Fitted, frame: Frame) -> SetupFault:

@@ -26,6 +26,10 @@ WRONG = {
         with_points(r, r.key_points_mm * [-1.0, 1.0, 1.0]), lambda u: u[:, [2, 1, 0]]
     ),
     "psi and sign": lambda r: driven(r, lambda u: u * [1.0, -1.0, 1.0] / 6.894757293168361),
+    "kPa converted from psi and sign": lambda r: driven(
+        r, lambda u: u * [1.0, -1.0, 1.0] * 6.894757293168361
+    ),
+    "inches converted from cm": lambda r: with_points(r, r.key_points_mm / 2.54),
     "reversed and too large": lambda r: with_points(r, r.key_points_mm[:, ::-1] * 1000),
     "ms and late": lambda r: in_time(late(r, 5), 1e3),
     "s read as ms": lambda r: in_time(r, 1e-3),

@@ -68,6 +68,21 @@ SINGLE = {
     "psi": (actuation(lambda u: u / PSI), "actuation_unit", "in psi where kPa is stated"),
     "bar": (actuation(lambda u: u / 100), "actuation_unit", "in bar where kPa is stated"),
     "Pa": (actuation(lambda u: u * 1000), "actuation_unit", "in Pa where kPa is stated"),
+    "kPa converted from psi": (
+        actuation(lambda u: u * PSI),
+        "actuation_unit",
+        "6.89476 times too large: kPa were read as psi",
+    ),
+    "psi converted from bar": (
+        actuation(lambda u: u * 100 / PSI),
+        "actuation_unit",
+        "14.5038 times too large: psi were read as bar and converted to kPa",
+    ),
+    "inches converted from cm": (
+        points(lambda x: x / 2.54),
+        "length_unit",
+        "2.54 times too small: inches were read as cm and converted to mm",
+    ),
     "permuted": (
         actuation(lambda u: u[:, [1, 2, 0]]),
         "chambers",
@@ -160,6 +175,7 @@ PHYSICS = {
     "nothing": lambda r: r,
     "a misalignment of 5 degrees": lambda r: turned(r, [0.05, 0.07, -0.02], [2.0, -1.0, 0.5]),
     "a gain of 7 %": actuation(lambda u: u * [1.07, 1.0, 1.0]),
+    "a gain that is between those of two units": actuation(lambda u: u * 5.0),
     "a lag of 0.25 s": lambda r: lagged(r, 0.25),
     "a lag of 0.6 s": lambda r: lagged(r, 0.6),
     "a lag of 30 s": lambda r: lagged(r, 30.0),

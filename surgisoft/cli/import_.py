@@ -119,6 +119,8 @@ def import_(
     for part, target in zip(parts, targets, strict=True):
         for note in part.notes:
             print(f"note: {note}")
+        for warning in part.warnings:
+            warn(f"{target}: {warning}")
         for found in find_warnings(part.recording):
             warn(f"{target}, row {found.sample + 1}: {found.text}")
         first, *rest = summary(part.recording)

@@ -629,7 +629,7 @@ def test_an_import_names_what_looks_wrong(bench, tmp_path, capsys, monkeypatch):
     from surgisoft.measurement.recordings import load_recording
 
     some = load_recording(bench / "bench.parquet")
-    parts = [SimpleNamespace(recording=some, notes=("the clock was set",), files=())]
+    parts = [SimpleNamespace(recording=some, notes=("the clock was set",), files=(), warnings=())]
     monkeypatch.setattr("surgisoft.measurement.importing.import_recordings", lambda *_: parts)
     wrong = SimpleNamespace(sample=4, text="a jump of 30 mm")
     monkeypatch.setattr("surgisoft.measurement.recordings.find_warnings", lambda rec: [wrong])

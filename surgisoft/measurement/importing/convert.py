@@ -18,6 +18,7 @@ from surgisoft.command_line import typed
 from surgisoft.errors import InputError
 from surgisoft.files import resolved
 from surgisoft.measurement.importing.align import Joined, join
+from surgisoft.measurement.importing.following import following_warnings
 from surgisoft.measurement.importing.names import check_columns, uses
 from surgisoft.measurement.importing.plausible import plausibility_notes
 from surgisoft.measurement.importing.points import (
@@ -73,6 +74,8 @@ class Imported:
     """What was left out, joined or fitted, in words."""
     files: tuple[Path, ...] = ()
     """The files that it was read from."""
+    warnings: tuple[str, ...] = ()
+    """What says that the files do not belong together, in words."""
 
 
 def import_files(paths: Sequence[Path], spec: ImportMap, name: str | None) -> list[Imported]:
@@ -511,4 +514,5 @@ def _finished(part: Imported, spec: ImportMap) -> Imported:
     if spec.runs.gap_s is None and (found := gaps_in_words(recording)):
         notes = [*notes, found]
     notes = [*notes, *timing_notes(recording, spec.measured.delay_s)]
-    return replace(part, recording=recording, notes=notes)
+    warnings = tuple(following_warnings(recording, spec.measured.delay_s))
+    return replace(part, recording=recording, notes=notes, warnings=warnings)

@@ -119,6 +119,23 @@ class Moves:
         table = np.stack([errors[s] for s in shifts.tolist()])
         return shifts, int(table.sum(axis=1).argmin()), table
 
+    def explained_at(self, shift: int, length: int, most_rows: int) -> float:
+        """Share of the moves of this length that the actuation, shifted by any number of samples,
+        explains: cross-validated, of at most about `most_rows` moves; 0 for too few."""
+        rows, moved = [], []
+        every = max(1, sum(len(part) for part in self.body) // most_rows)
+        for part in self.body:
+            at = np.arange(max(shift, 0) + length, len(part) + min(shift, 0), every)
+            move = part[at] - part[at - length]
+            known = ~np.isnan(move).any(axis=1)
+            rows.append(at[known])
+            moved.append(move[known])
+        body = np.concatenate(moved)
+        if len(body) < LEAST_ROWS:
+            return 0.0
+        errors = self._errors(rows, body, length, shift)
+        return 1 - float(errors.sum() / max(np.square(body).sum(), 1e-300))
+
     def _ahead(self, length: int) -> int:
         """Largest shift, in samples, that leaves two thirds of a usual run to look at."""
         usual = int(np.median([len(part) for part in self.body]))

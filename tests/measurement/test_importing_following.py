@@ -1,0 +1,115 @@
+"""Key points that do not follow the actuation are told; arms that follow it in any way are not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from surgisoft.cli import run
+from surgisoft.measurement.importing.following import following, following_warnings
+from surgisoft.measurement.recordings import Recording
+from tests.measurement.test_recording_timing import RATE_HZ, bent, lagged, played, wander
+
+SECONDS = 200
+MAP = """
+[file.cam]
+match = "*_cam.csv"
+
+[file.air]
+match = "*_air.csv"
+join = "time"
+time = "t_s"
+
+[time]
+column = "t_s"
+
+[measured]
+file = "air"
+columns = ["p1_kPa", "p2_kPa", "p3_kPa"]
+unit = "kPa"
+
+[key_points]
+positions = [["k0_x", "k0_y", "k0_z"], ["k1_x", "k1_y", "k1_z"]]
+unit = "mm"
+"""
+
+
+def recorded(change=lambda p: p, seed=0, seconds=SECONDS, noise_mm=0.05, kind="continuous"):
+    """An arm that its changed actuation bends; noise of the cameras."""
+    rng = np.random.default_rng(seed)
+    p = wander(rng, seconds)
+    points = bent(change(p))
+    t_s = np.arange(len(p)) / RATE_HZ
+    points = points + rng.normal(0.0, noise_mm, points.shape)
+    return Recording("arm", t_s, p, points, kind=kind)
+
+
+FOLLOWS = {
+    "at once": lambda p: p,
+    "behind a lag of 1 s": lambda p: lagged(p, 1.0),
+    "behind a lag of 20 s": lambda p: lagged(p, 20.0),
+    "behind three lags of 0.5 s": lambda p: lagged(p, 0.5, 3),
+    "with hysteresis": lambda p: played(p, 12.0),
+    "with one chamber of three": lambda p: np.concatenate([p[:, :1], 0 * p[:, 1:] + 20.0], axis=1),
+    "with creep": lambda p: p + 0.5 * lagged(p, 60.0),
+}
+
+
+@pytest.mark.parametrize("name", FOLLOWS)
+def test_an_arm_that_follows_in_any_way_is_not_told(name):
+    given = recorded(FOLLOWS[name])
+    assert following_warnings(given, 0.0) == []
+    assert following(given).explained > 0.5
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_log_of_another_recording_is_told(seed):
+    """The actuation of another seed has nothing to do with the body."""
+    given = recorded(lambda p: lagged(p, 0.3), seed)
+    mixed = replace(given, measured=recorded(seed=seed + 100).measured)
+    (warning,) = following_warnings(mixed, 0.0)
+    assert "the key points do not follow the actuation" in warning
+    assert "check that the files are of the same recording" in warning
+
+
+@pytest.mark.parametrize("offset_s", [25.0, -12.0])
+def test_clocks_far_apart_are_no_other_recording(offset_s):
+    """The body of a recording whose camera started later than the log, and the other way round."""
+    given, rows = recorded(seconds=250), round(abs(offset_s) * RATE_HZ)
+    late, rest = slice(rows, None), slice(None, -rows)
+    body, log = (rest, late) if offset_s > 0 else (late, rest)
+    apart = Recording("arm", given.t_s[rest], given.measured[log], given.key_points_mm[body])
+    (warning,) = following_warnings(apart, 0.0)
+    assert f"{abs(offset_s):.3g} s {'late' if offset_s > 0 else 'early'}" in warning
+    assert f"set delay_s = {-offset_s:.3g} in [measured]" in warning
+    corrected = replace(apart, measured=given.measured[body])
+    assert following_warnings(corrected, 0.0) == []
+
+
+def test_what_a_recording_cannot_show_is_not_told():
+    given = recorded()
+    mixed = replace(given, measured=recorded(seed=50).measured)
+    assert following(replace(mixed, kind="settled")) is None
+    few = slice(0, 300)
+    short = Recording("arm", mixed.t_s[few], mixed.measured[few], mixed.key_points_mm[few])
+    assert following(short) is None
+    noise = np.random.default_rng(0).normal(0.0, 1.0, given.key_points_mm.shape)
+    assert following(replace(given, key_points_mm=noise)) is None
+    assert following(replace(given, measured=np.full_like(given.measured, 10.0))) is None
+
+
+def test_an_import_warns_of_files_that_do_not_belong_together(tmp_path, capsys):
+    """The air log of one recording, and the camera's file of another one."""
+    body, air = recorded(seed=1), recorded(seed=2)
+    log = np.column_stack([air.t_s, air.measured])
+    header = "t_s,p1_kPa,p2_kPa,p3_kPa"
+    np.savetxt(tmp_path / "a_air.csv", log, delimiter=",", header=header, comments="")
+    seen = np.column_stack([body.t_s, body.key_points_mm.reshape(len(body.t_s), -1)])
+    header = "t_s," + ",".join(f"k{k}_{axis}" for k in range(2) for axis in "xyz")
+    np.savetxt(tmp_path / "a_cam.csv", seen, delimiter=",", header=header, comments="")
+    (tmp_path / "map.toml").write_text(MAP)
+    given = ["import", str(tmp_path / "a_air.csv"), str(tmp_path / "a_cam.csv")]
+    asked = ["--map", str(tmp_path / "map.toml"), "-o", str(tmp_path / "a.parquet")]
+    assert run([*given, *asked]) == 0
+    said = capsys.readouterr()
+    assert "a.parquet: the key points do not follow the actuation" in said.out + said.err

@@ -1084,13 +1084,12 @@ def sentence_of(
             f"{reached[0]:.3g} mm remain on {where}; {error}"
         )
     if kind == "ambiguous":
-        each = f"each would leave about {reached[0]:.3g} mm"
+        left = f"each would leave about {reached[0]:.3g} mm on {where}"
         if max(reached) > ABOUT * min(reached):
-            values = " and ".join(f"{value:.3g} mm" for value in reached)
-            each = f"they would leave {values}, in this order,"
+            left = f"{_each_leaves(decision, reached)} on {where}{_one_alone(decision, reached)}"
         return (
             f"cannot tell {' from '.join(effects)} with these recordings (confidence {sure:.2f} "
-            f"that it is one of them): {each} on {where}; {error}"
+            f"that it is one of them): {left}; {error}"
         )
     if kind == "unknown_effect":
         return (
@@ -1107,6 +1106,24 @@ def sentence_of(
         most = f" (most probable: {most})" if most else ""
         return f"cannot tell what is missing, if anything: {why}{most}; {error}"
     return f"these recordings show no missing effect (confidence {sure:.2f}); {error}"
+
+
+def _each_leaves(decision: Decision, reached: Sequence[float]) -> str:
+    """The error that each effect of a set would leave, beside its name."""
+    first, *others = zip(decision.effects, reached, strict=True)
+    parts = [f"{first[0]} would leave {first[1]:.3g} mm"]
+    parts += [f"{name} {value:.3g} mm" for name, value in others]
+    return " and ".join(parts)
+
+
+def _one_alone(decision: Decision, reached: Sequence[float]) -> str:
+    """Why the effect that leaves least is not named alone: its probability, which was calibrated on
+    other arms, where the effect that left more was the missing one in such a share of cases."""
+    least = decision.effects[int(np.argmin(reached))]
+    alone = decision.probabilities.effects.get(least)
+    if alone is None:
+        return ""
+    return f", which makes it {least} with a probability of {alone:.2f} only"
 
 
 def _why(reason: str, levels: ErrorLevels, static: bool) -> str:

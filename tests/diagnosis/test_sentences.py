@@ -304,8 +304,18 @@ def test_a_static_function_is_named_only_where_it_explains_most():
 def test_effects_of_a_set_that_leave_different_errors_have_one_each():
     given = decision("ambiguous", "creep", "drift")
     assert "each would leave about 0.15 mm on" in sentence_of(given, LEVELS, [0.15, 0.16])
-    text = "they would leave 0.15 mm and 0.3 mm, in this order, on"
+    alone = given.probabilities.effects["creep"]
+    text = (
+        "creep would leave 0.15 mm and drift 0.3 mm on held-out blocks, which makes it creep with "
+    )
+    text += f"a probability of {alone:.2f} only; error"
     assert text in sentence_of(given, LEVELS, [0.15, 0.3])
+    other = given.probabilities.effects["drift"]
+    said = sentence_of(given, LEVELS, [0.3, 0.15])
+    assert f"makes it drift with a probability of {other:.2f}" in said
+    unknown = decision("ambiguous", "creep", "drift", chances=NONE)
+    said = sentence_of(unknown, LEVELS, [0.15, 0.3])
+    assert "would leave 0.15 mm and drift 0.3 mm on held-out blocks; error" in said
 
 
 def test_a_periodic_motion_is_said_with_its_frequency():

@@ -28,6 +28,8 @@ from surgisoft.cli.options import (
     Replay,
     Report,
     before_options,
+    given_options,
+    model_options,
     complete_effects,
     with_effect_files,
 )
@@ -156,10 +158,12 @@ def amend(
     if saved:
         print(f"wrote {output}: {result.model.summary()}")
         files = typed(*data)
-        following = f"surgisoft diagnose {typed(output)} {files}"
+        same = model_options(None, model_error)
+        same += given_options({"--refit": None if refit == "auto" else refit})
+        following = f"surgisoft diagnose {typed(output)} {files}{same}"
         if before:
-            given = before_options(before, paired)
-            following = f"surgisoft improve {typed(model)} {files}{given} -o OTHER"
+            same = before_options(before, paired) + same
+            following = f"surgisoft improve {typed(model)} {files}{same} -o OTHER"
         print(f"next, find further effects: {with_effect_files(following)}")
     else:
         print(f"{output} was not written; --anyway writes it nevertheless", flush=True)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from shlex import quote
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -18,6 +17,7 @@ from surgisoft.cli.options import (
     ExperimentFile,
     Preflight,
     RigsOfArms,
+    given_options,
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
@@ -104,10 +104,8 @@ def run(
                 "--processes": None if processes == 1 else processes, "--cluster": cluster,
                 "--no-replays": not replays, "--credibility": credibility,
             }  # fmt: skip
-            again = (
-                f"surgisoft experiment run {typed(file)} -o {typed(folder)} --resume{_again(given)}"
-            )
-            again = with_effect_files(again)
+            again = f"surgisoft experiment run {typed(file)} -o {typed(folder)} --resume"
+            again = with_effect_files(again + given_options(given))
             print(f"stopped; {folder} keeps the finished blocks; continue with: {again}")
             raise typer.Exit(INTERRUPTED) from None
     if context is not None:
@@ -122,17 +120,6 @@ def run(
     if context is not None:
         print(f"credibility: {assessed.sentence}")
     show_written(files)
-
-
-def _again(given: dict[str, Any]) -> str:
-    """Options of a command to run next, by their names; those without a value are left out."""
-    text = ""
-    for name, value in given.items():
-        if value is None or value is False:
-            continue
-        values = [] if value is True else value if isinstance(value, list) else [value]
-        text += " ".join([f" {name}", *(quote(str(each)) for each in values)])
-    return text
 
 
 @commands.command("check")

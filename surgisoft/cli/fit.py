@@ -14,6 +14,7 @@ from surgisoft.cli.options import (
     Recordings,
     Threads,
     complete_memories,
+    given_options,
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
@@ -27,6 +28,14 @@ ABOVE_NOISE = 2.0
 """Ratio of the held-out error to the noise from which `fit` advises to try effects with memory."""
 WIDTHS = "128,128,128,128"
 """Default of --widths."""
+INPUTS: Literal["pressure+direction"] = "pressure+direction"
+"""Default of --inputs."""
+ACTUATION: Literal["measured"] = "measured"
+"""Default of --actuation."""
+MEMBERS = 1
+"""Default of --members: no ensemble."""
+EPOCHS = 200
+"""Default of --epochs."""
 
 
 @app.command()
@@ -46,7 +55,7 @@ def fit(
     inputs: Annotated[
         Literal["pressure", "pressure+direction"],
         typer.Option(help="Inputs of the network for each chamber."),
-    ] = "pressure+direction",
+    ] = INPUTS,
     effects: Annotated[
         list[str] | None,
         typer.Option(
@@ -82,17 +91,17 @@ def fit(
             "without a different part of the data. Lower error with small data sets; slower "
             "to evaluate.",
         ),
-    ] = 1,
+    ] = MEMBERS,
     widths: Annotated[
         str, typer.Option(metavar="N,N...", help="Widths of HAW-NN's hidden layers.")
     ] = WIDTHS,
     actuation: Annotated[
         Literal["measured", "commanded"],
         typer.Option(help="Which actuation is the model's input."),
-    ] = "measured",
+    ] = ACTUATION,
     epochs: Annotated[
         int, typer.Option(min=1, help="Largest number of epochs of a stage; at least 10.")
-    ] = 200,
+    ] = EPOCHS,
     seed: Annotated[
         int,
         typer.Option(
@@ -148,10 +157,19 @@ def fit(
         raise typer.Exit(INTERRUPTED)
     moved = any(recording.kind == "continuous" for recording in train)
     if not effects and network == "haw_nn" and moved and above_noise(result.model.validation):
-        given = f" --valid {typed(*valid)}" if valid else ""
-        given += " --actuation commanded" if actuation == "commanded" else ""
+        given = {
+            "--valid": valid,
+            "--inputs": None if inputs == INPUTS else inputs,
+            "--prior": prior,
+            "--members": None if members == MEMBERS else members,
+            "--widths": None if widths == WIDTHS else widths,
+            "--actuation": None if actuation == ACTUATION else actuation,
+            "--epochs": None if epochs == EPOCHS else epochs,
+            "--seed": seed or None,
+            "--threads": None if threads == 1 else threads,
+        }
         new = typed(f"{output}_with_effects")
-        again = f"surgisoft fit {typed(*recordings)}{given} --effects auto -o {new}"
+        again = f"surgisoft fit {typed(*recordings)}{given_options(given)} --effects auto -o {new}"
         again = with_effect_files(again)
         print(f"next, whether the arm has memory that this model lacks: {again}")
     following = with_effect_files(

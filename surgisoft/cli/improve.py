@@ -29,12 +29,17 @@ from surgisoft.cli.options import (
     Report,
     before_files,
     before_options,
+    given_options,
+    model_options,
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
 from surgisoft.command_line import typed
 from surgisoft.errors import Interrupted
 from surgisoft.files import write_json
+
+MOST = 6
+"""Default of --max-effects."""
 
 
 @app.command()
@@ -44,7 +49,7 @@ def improve(
     output: NewModel,
     most: Annotated[
         int, typer.Option("--max-effects", min=1, help="Largest number of effects to add.")
-    ] = 6,
+    ] = MOST,
     before: Before = None,
     paired: Paired = "auto",
     json_file: JsonFile = None,
@@ -140,7 +145,13 @@ def improve(
     if result.interrupted:
         files = typed(*recordings)
         start = typed(model if before else output)
-        again = f"surgisoft improve {start} {files}{before_options(before, paired)} -o OTHER"
+        same = {
+            "--max-effects": None if most == MOST else most,
+            "--refit": None if refit == "auto" else refit,
+        }
+        options = before_options(before, paired) + model_options(None, model_error)
+        options += given_options(same)
+        again = f"surgisoft improve {start} {files}{options} -o OTHER"
         following = with_effect_files(again)
         print(f"next, to seek further effects: {following}")
         raise typer.Exit(INTERRUPTED)

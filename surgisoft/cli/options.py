@@ -2,9 +2,9 @@
 
 import os
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from typer import Argument, Option
 
@@ -173,6 +173,21 @@ def model_options(predictions: list[Path] | None, error_mm: float | None) -> str
     """The options of a command to run next that say what MODEL is, as this call was given them."""
     text = f" --predictions {typed(*predictions)}" if predictions else ""
     return text if error_mm is None else f"{text} --model-error {error_mm:g}"
+
+
+def given_options(given: Mapping[str, Any]) -> str:
+    """Options of a command to run next, by their names, as this call was given them.
+
+    given: value of each option; those with None or False are left out, those with True have no
+    value, and a list or tuple gives several.
+    """
+    text = ""
+    for name, value in given.items():
+        if value is None or value is False:
+            continue
+        values = () if value is True else value if isinstance(value, list | tuple) else (value,)
+        text += f" {typed(name, *values)}"
+    return text
 
 
 Run = Annotated[Path, Argument(metavar="RUN", help="Folder of a training run.")]

@@ -853,6 +853,46 @@ def test_after_a_fit_the_advice_keeps_the_validation_recordings(spaced, capsys, 
     assert "--valid" not in capsys.readouterr().out
 
 
+def test_after_a_fit_the_advice_keeps_the_settings_of_the_fit(spaced, capsys, monkeypatch):
+    fitted(monkeypatch)
+    new = str(Path(spaced).with_name("new arm"))
+    given = [
+        "--inputs", "pressure", "--prior", "none", "--members", "2", "--widths", "8,8",
+        "--actuation", "commanded", "--epochs", "20", "--seed", "3", "--threads", "2",
+    ]  # fmt: skip
+    assert run(["fit", spaced, *given, "-o", new]) == 0
+    memory, _ = capsys.readouterr().out.splitlines()[-2:]
+    advised = ["--effects", "auto", "-o", f"{new}_with_effects"]
+    assert words_of(memory) == ["surgisoft", "fit", spaced, *given, *advised]
+    assert run(["fit", spaced, "-o", new]) == 0
+    memory, _ = capsys.readouterr().out.splitlines()[-2:]
+    assert words_of(memory) == ["surgisoft", "fit", spaced, *advised]
+
+
+def test_after_an_amendment_the_advice_keeps_what_is_known_of_the_model(
+    spaced, capsys, monkeypatch
+):
+    monkeypatch.setattr("surgisoft.surrogate.checkpoint.save_model", lambda *_: None)
+    found = SimpleNamespace(
+        model=SimpleNamespace(summary=lambda: "an arm"), notes=(), claimed=True, refitted=(),
+        effects=("creep",), parameters=(), in_words={}, retuned=False, refit=None,
+        sentence="less", to_json=dict,
+    )  # fmt: skip
+    monkeypatch.setattr("surgisoft.diagnosis.amend.amend", lambda *_, **__: found)
+    new = str(Path(spaced).with_name("new arm"))
+    given = ["--model-error", "0.5", "--refit", "never"]
+
+    def last(*more: str) -> list[str]:
+        command = ["amend", "default", "--data", spaced, "--effect", "creep", *more, *given, "-o", new]
+        assert run(command) == 0
+        return words_of(capsys.readouterr().out.splitlines()[-1])
+
+    assert last() == ["surgisoft", "diagnose", new, spaced, *given]
+    assert last("--before", spaced) == [
+        "surgisoft", "improve", "default", spaced, "--before", spaced, *given, "-o", "OTHER",
+    ]  # fmt: skip
+
+
 def test_printed_commands_quote_paths_with_spaces(spaced, capsys, monkeypatch):
     folder = Path(spaced).parent
     new = str(folder / "new arm")

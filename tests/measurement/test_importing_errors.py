@@ -139,6 +139,8 @@ MAPS = [
         'unit = "mm"\n[commanded]\nrepeated = "interpolate"',
         "commanded.repeated: got text 'interpolate'; expected \"keep\": a command is held",
     ),
+    ('unit = "kPa"', 'unit = "kPa"\noptional = true', "optional: got true; expected none beside"),
+    ('columns = ["u"]\nunit = "kPa"', "optional = true", "optional: got true; expected none: every"),
 ]
 
 RAW = "t,u,x,y,z\n0,1,2,3,4\n1,2,3,4,5\n"
@@ -301,6 +303,23 @@ def test_command_and_measurement_must_fit(tmp_path):
         map_path.write_text(f"{GOOD}[commanded]\n{extra}\n")
         spec = load_map(str(map_path))
         assert expected in message_of(lambda spec=spec: import_files([path], spec, "x"))
+
+
+def test_a_map_of_commands_needs_their_columns(tmp_path):
+    path, map_path = tmp_path / "raw.csv", tmp_path / "map.toml"
+    path.write_text(RAW)
+    map_path.write_text(f'{GOOD}[commanded]\nto = "psi"\n')
+    spec = load_map(str(map_path))
+    assert message_of(lambda: import_files([path], spec, "x")) == (
+        f"{path}: no column 'c1_kPa' or with another unit, expected the commanded actuation; name "
+        "its columns in [commanded] of the map, or leave the table out"
+    )
+    map_path.write_text(f"{GOOD}[commanded]\noptional = true\n")
+    (part,) = import_files([path], load_map(str(map_path)), "x")
+    assert part.recording.commanded is None
+    path.write_text("t,u,x,y,z,c1_kPa\n0,1,2,3,4,7\n1,2,3,4,5,8\n")
+    (part,) = import_files([path], load_map(str(map_path)), "x")
+    assert part.recording.commanded.tolist() == [[7.0], [8.0]]
 
 
 @pytest.mark.parametrize(

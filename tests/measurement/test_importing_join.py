@@ -196,7 +196,7 @@ def test_runs_have_a_command_if_each_of_their_files_has_one(tmp_path):
     both = written(tmp_path / "a.csv", text(values, header=["t", "u", "x", "y", "w", "c1_kPa"]))
     lacking = written(tmp_path / "b.csv", text(values, header=["t", "u", "x", "y", "w", "z"]))
     content = ONE.replace("ROWS", "").replace('["x", "y", "z"], ', "")
-    content = content.replace("KEYS", "[commanded]")
+    content = content.replace("KEYS", "[commanded]\noptional = true")
     again = written(tmp_path / "again.csv", both.read_bytes())
     (part,) = run(tmp_path, [both, again], content)
     np.testing.assert_array_equal(part.recording.commanded[:, 0], [5, 11, 17, 5, 11, 17])
@@ -357,6 +357,14 @@ def test_rows_are_cut_and_thinned(tmp_path):
     part = one(tmp_path, path, "[rows]\nfirst = 3\nlast = 12\nevery = 4")
     np.testing.assert_array_equal(part.recording.measured[:, 0], [2, 6, 10])
     np.testing.assert_array_equal(part.recording.t_s, [0, 4, 8])
+
+
+def test_thinning_begins_anew_with_each_run(tmp_path):
+    """Runs of 5, 2 and 4 rows keep each third row from their first: no run is lost."""
+    path = log(tmp_path, np.arange(11.0), label=list("aaaaabbcccc"))
+    part = one(tmp_path, path, '[rows]\nevery = 3\n[runs]\ncolumn = "label"')
+    np.testing.assert_array_equal(part.recording.t_s, [0, 3, 5, 7, 10])
+    np.testing.assert_array_equal(part.recording.run, [0, 0, 1, 2, 2])
 
 
 def test_rows_that_repeat_are_dropped_when_asked(tmp_path):

@@ -299,13 +299,14 @@ def _with_columns(spec: ActuationMap, tables: dict[str, RawTable], part: str) ->
             f"{table.path}: columns {', '.join(name for _, _, name in found)}, expected "
             f"{letter}1_UNIT, {letter}2_UNIT, ... of one unit without gaps, or columns in the map"
         )
-    if not found and part == "measured":
-        raise InputError(
-            f"{table.path}: no column 'p1_kPa' or with another unit, expected the measured "
-            "actuation; name its columns in [measured] of the map"
-        )
-    if not found:
+    if not found and spec.optional:
         return spec
+    if not found:
+        without = ", or leave the table out" if part == "commanded" else ""
+        raise InputError(
+            f"{table.path}: no column '{letter}1_kPa' or with another unit, expected the {part} "
+            f"actuation; name its columns in [{part}] of the map{without}"
+        )
     names = tuple(name for _, _, name in found)
     counted = f"{names[0]}{f' ... {names[-1]}' if names[1:] else ''}"
     for field in ("scale", "offset"):

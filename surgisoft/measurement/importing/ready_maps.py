@@ -23,7 +23,8 @@ column = "Time"
 file = "log"              # every column named p1_UNIT, p2_UNIT, ...
 
 [commanded]
-file = "log"              # every column named c1_UNIT, ..., if there are any
+file = "log"              # every column named c1_UNIT, ...
+optional = true           # if there are any
 
 [key_points]
 @AUTO@

@@ -56,7 +56,7 @@ def tidy(draft: Draft, spec: ImportMap, place: Callable[[int], str]) -> tuple[Dr
     draft = _in_time(draft, spec, notes, place)
     if spec.rows.average is not None:
         draft = _averaged(draft, notes)
-    return draft.take(np.arange(0, len(draft.t_s), spec.rows.every)), notes
+    return draft.take(_row_of_run(draft.run) % spec.rows.every == 0), notes
 
 
 def run_numbers(
@@ -79,6 +79,13 @@ def point_numbers(labels: list[str]) -> np.ndarray:
     changes = [i == 0 or labels[i] != labels[i - 1] for i in range(len(labels))]
     none = np.array([label.lower() in ("", "nan", "none") for label in labels], bool)
     return np.where(none, -1, np.cumsum(changes))
+
+
+def _row_of_run(run: np.ndarray) -> np.ndarray:
+    """(T,) number of each row within its run, from 0; run: (T,) number of the run of each row."""
+    row = np.arange(len(run))
+    starts = np.r_[True, run[1:] != run[:-1]][: len(run)]
+    return row - np.maximum.accumulate(np.where(starts, row, 0))
 
 
 def _with_known_actuation(draft: Draft, notes: list[str], place: Callable[[int], str]) -> Draft:

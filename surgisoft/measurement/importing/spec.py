@@ -134,9 +134,13 @@ class ActuationMap:
     repeated: Annotated[str, one_of(("keep", "interpolate"))] = "keep"
     """Readings of a sensor that is slower than the log: "keep" them held until the next one, or
     "interpolate" between readings."""
+    optional: bool = False
+    """Whether [commanded] counts only where the file has columns named as in a recording."""
 
     def checked(self, where: Where) -> "ActuationMap":
         """The table itself; raises InputError for missing units or numbers that do not fit."""
+        if self.columns and self.optional:
+            raise (where / "optional").error("got true", "none beside columns, which are required")
         if self.columns and not self.unit:
             raise (where / "unit").error("missing", 'the columns\' unit such as "kPa"')
         if self.to and self.unit:
@@ -276,7 +280,7 @@ class RowsMap:
     last: int | None = None
     """Last row of the main file to import; none: all."""
     every: Annotated[int, at_least(1)] = 1
-    """Keep each n-th row."""
+    """Keep each n-th row of a run, from its first."""
     repeated_time: Annotated[str, one_of(("error", "drop"))] = "error"
     """Rows whose time does not increase over the row before: "error" or "drop"."""
     duplicates: Annotated[str, one_of(("keep", "drop"))] = "keep"
@@ -385,6 +389,10 @@ class ImportMap:
         if main.join == "time" or main.offset_rows:
             raise (where / "file" / self.main).error(
                 "the first file is the main one", "join and offset_rows at the others only"
+            )
+        if self.measured.optional:
+            raise (where / "measured" / "optional").error(
+                "got true", "none: every recording has a measured actuation"
             )
         if self.commanded and self.commanded.repeated != "keep":
             raise (where / "commanded" / "repeated").error(

@@ -347,6 +347,9 @@ class RigArm:
         reading = Reading(
             *(torch.tensor(each, dtype=torch.float32, device=self.device) for each in columns)
         )
+        # A pressure sensor may be silent for a moment: its chamber keeps the pressure it had.
+        heard = reading.pressure.isfinite()
+        reading = replace(reading, pressure=reading.pressure.where(heard, part.pressure))
         part = replace(part, plant=replace(part.plant, target_kPa=target))
         return self.observer.followed(part, reading.pressure, self.period_s), reading
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import (
     AlarmInfo,
     Recording,
@@ -19,6 +20,7 @@ from surgisoft.measurement.recordings import (
     save_recording,
 )
 from surgisoft.measurement.recordings.log import LogHeader, RecordingLog, recording_log
+from surgisoft.measurement.recordings.recording import usable_samples
 from surgisoft.measurement.recordings.sidecar import sidecar_of
 from surgisoft.rig.interface import Rig, Sample
 
@@ -72,10 +74,33 @@ class RunLog:
                 sample.temp_C,
             )
 
-    def recording(self, name: str, alarm: AlarmInfo | None = None) -> Recording:
-        """The samples so far as a recording; alarm: the first one of the run."""
-        rig, count = self.rig, min(len(self.samples), len(self.runs))
+    @property
+    def usable(self) -> np.ndarray:
+        """(T,) bool: the samples so far that a recording can have."""
+        count = min(len(self.samples), len(self.runs))
+        if count == 0:
+            return np.zeros(0, bool)
         samples = self.samples[:count]
+        return usable_samples(
+            np.array([sample.t_s for sample in samples]),
+            np.array(self.runs[:count], np.int64),
+            np.array([sample.measured for sample in samples]),
+            np.array([sample.commanded for sample in samples]),
+        )
+
+    def recording(self, name: str, alarm: AlarmInfo | None = None) -> Recording:
+        """The samples so far as a recording; alarm: the first one of the run.
+
+        Samples that it cannot have (`usable_samples`) are left out. Raises InputError where none
+        is left.
+        """
+        rig, usable = self.rig, self.usable
+        if not usable.any():
+            raise InputError(
+                "no sample of the run has every pressure, so there is no recording; are the "
+                "sensors connected?"
+            )
+        samples = [sample for sample, kept in zip(self.samples, usable, strict=False) if kept]
         room = [sample.temp_C for sample in samples]
         payload = rig.payload_g
         return Recording(
@@ -84,7 +109,7 @@ class RunLog:
             measured=np.array([sample.measured for sample in samples]),
             key_points_mm=np.array([sample.key_points_mm for sample in samples]),
             commanded=np.array([sample.commanded for sample in samples]),
-            run=np.array(self.runs[:count], np.int64),
+            run=np.array(self.runs[: len(usable)], np.int64)[usable],
             unit=rig.unit,
             temp_C=None if None in room else np.array(room, np.float64),
             payload_g=None if payload is None else np.full(len(samples), payload),
@@ -96,7 +121,10 @@ class RunLog:
         )
 
     def finish(self, name: str, alarm: AlarmInfo | None = None) -> Recording | None:
-        """The recording, written in its final form; None without a sample. See `recording`."""
+        """The recording, written in its final form; None without a sample. See `recording`.
+
+        Where it raises InputError the log stays.
+        """
         self.close()
         found = self.recording(name, alarm) if self.samples else None
         if found is not None and self.path is not None:

@@ -49,6 +49,7 @@ from surgisoft.measurement.recordings import (
     load_recordings,
     save_recording,
 )
+from surgisoft.measurement.recordings.recording import left_out
 from surgisoft.progress import Progress, silent
 from surgisoft.rig.collect import check_fits as check_protocol
 from surgisoft.rig.collect import runs_of
@@ -412,11 +413,18 @@ class _Session:
 
     def _keep(self, log: RunLog) -> None:
         """Write what was recorded before an error, where there is something."""
-        if len(log.samples) > 1:
-            log.finish(self._name)
-            self.on_warning(f"the {len(log.samples)} samples until then were written: {log.path}")
+        if len(log.samples) > 1 and log.usable.any():
+            self._tell_left_out(log)
+            found = log.finish(self._name)
+            assert found is not None, "there are samples"
+            self.on_warning(f"the {found.samples} samples until then were written: {log.path}")
         else:
             log.discard()
+
+    def _tell_left_out(self, log: RunLog) -> None:
+        """Say how many samples the recording cannot have, where there are such."""
+        if count := int((~log.usable).sum()):
+            self.on_warning(left_out(count))
 
     @contextmanager
     def _shown(self, rig: Rig) -> Iterator[None]:
@@ -807,6 +815,8 @@ class _Session:
         charts = self.charts
         alarms = tuple(charts.alarms) if charts is not None else ()
         first = AlarmInfo(alarms[0].at_s, alarms[0].since_s) if alarms else None
+        if log.samples:
+            self._tell_left_out(log)
         recording = log.finish(self._name, first) if log.samples else None
         if recording is None:
             log.discard()

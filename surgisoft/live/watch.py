@@ -43,8 +43,12 @@ class Companion:
 
     @torch.inference_mode()
     def predict(self, sample: Sample) -> np.ndarray:
-        """(n, 3) predicted key points at a sample [mm], arm base frame."""
+        """(n, 3) predicted key points at a sample [mm], arm base frame.
+
+        A chamber whose sensor is silent in the sample keeps its last actuation.
+        """
         pressure = torch.tensor(self.actuation(sample), dtype=torch.float32)[None]
+        pressure = pressure.where(pressure.isfinite(), self._state.pressure)
         dt_s = 0.0 if self._last_s is None else sample.t_s - self._last_s
         self._last_s = sample.t_s
         room = None if sample.temp_C is None else torch.tensor([sample.temp_C]).float()
@@ -151,12 +155,14 @@ class WatchedRig:
             raise Finished
 
     def flush(self) -> None:
-        """Log, predict and report the last sample."""
+        """Log, predict and report the last sample; one without every pressure is not reported."""
         sample, self._pending = self._pending, None
         if sample is None:
             return
         self.log.write(sample, self._run)
         now = Instant(self.elapsed_s, sample, self.companion.predict(sample), self._run)
+        if not np.isfinite(sample.measured).all():
+            return
         for watch in self.watchers:
             watch(now)
 

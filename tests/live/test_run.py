@@ -22,6 +22,7 @@ from surgisoft.live.session import LEAD_IN_S, elsewhere, run
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.recordings import load_recording
 from surgisoft.rig import VirtualRig
+from surgisoft.rig.safety import RigStopped
 from surgisoft.surrogate.checkpoint import default_arm, load_model
 from surgisoft.tasks.path_following import FollowConfig
 from surgisoft.tasks.track import TrackConfig
@@ -239,6 +240,55 @@ def test_a_real_rig_is_vented_and_its_samples_are_kept(schedule, tmp_path, error
     assert load_recording(output).samples in (198, 199)
     np.testing.assert_array_equal(rig.last, 0.0)
     assert rig.closed
+
+
+class Silent(Real):
+    """A real rig whose second pressure sensor is silent in some reads, counted from 1."""
+
+    def __init__(self, first, last=10**9):
+        super().__init__()
+        self.silent = range(first, last + 1)
+
+    def read(self):
+        found = super().read()
+        if self.reads in self.silent:
+            found = replace(found, measured=np.where(np.arange(3) == 1, np.nan, found.measured))
+        return found
+
+
+def test_a_silent_sensor_ends_the_run_as_other_stops_do(schedule, tmp_path):
+    """At 20 Hz silence from the 201st read on is longer than two seconds at the 241st."""
+    output, warnings = tmp_path / "silent.parquet", []
+    stopped = r"^the pressure sensor of chamber 2 was silent for 2\.\d s; the rig is vented$"
+    with pytest.raises(RigStopped, match=stopped):
+        run(schedule, Silent(201), output=output, on_warning=warnings.append)
+    assert load_recording(output).samples == 200
+    assert "40 samples left out: without a pressure" in warnings[0]
+    assert warnings[1] == f"the 200 samples until then were written: {output}"
+    assert not (tmp_path / "silent.log.jsonl").exists()
+
+
+def test_a_sensor_that_is_silent_for_a_moment_costs_its_samples(schedule):
+    """The model goes on from the last pressure, so that its error is as before."""
+    warnings = []
+    found = run(schedule, Silent(201, 204), minutes=0.5, on_warning=warnings.append)
+    whole = run(schedule, Real(), minutes=0.5, on_warning=warnings.append)
+    assert warnings == ["4 samples left out: without a pressure, or with a time that is not later "
+                        "than the one before"]  # fmt: skip
+    assert found.recording.samples == len(found.predicted_mm) == whole.recording.samples - 4
+    assert found.rms_mm(begin_s=12.0) == pytest.approx(whole.rms_mm(begin_s=12.0), rel=0.02)
+
+
+def test_a_policy_goes_on_where_a_sensor_is_silent_for_a_moment():
+    config = TrackConfig(follow=FollowConfig(loop_s=4.0))
+    warnings = []
+    found = run(
+        "scripted", Silent(60, 63), task="track_circle", config=config, minutes=0.15,
+        on_warning=warnings.append,
+    )  # fmt: skip
+    assert len(warnings) == 1
+    assert np.isfinite(found.recording.commanded).all()
+    assert np.isfinite(found.predicted_mm).all()
 
 
 def test_the_log_of_a_run_that_never_ends_is_a_recording(schedule, tmp_path):

@@ -9,6 +9,7 @@ import tomli_w
 
 from surgisoft.diagnosis.setup.channels import frozen_points
 from surgisoft.diagnosis.setup.sample import Arrangement
+from surgisoft.diagnosis.weight import SAME_DEG, angle_deg
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import AlarmInfo, Recording
 from surgisoft.measurement.recordings.columns import MM_PER
@@ -55,6 +56,8 @@ class Correction:
     """Recorded key points that are frozen in some rows: they become missing there."""
     frozen: bool = False
     """Whether a channel is frozen in some rows: these are left out."""
+    gravity: tuple[float, float, float] | None = None
+    """(3,) unit vector along the weight where the model was fitted, true axes; None: unknown."""
 
     def applied(self, recording: Recording) -> Recording:
         """The corrected recording; rows that a shifted clock does not reach are left out."""
@@ -82,6 +85,7 @@ class Correction:
             measured=corrected,
             commanded=commanded,
             key_points_mm=self._points(recording.key_points_mm),
+            gravity=self._gravity(recording.gravity),
             unit=self.unit,
             source=None,
         )
@@ -105,6 +109,20 @@ class Correction:
         if self.origin_mm is not None:
             points = points - self.origin_mm
         return points if self.rotation is None else points @ self.rotation.T
+
+    def _gravity(self, stated: np.ndarray | None) -> np.ndarray | None:
+        """(3,) unit vector along the weight, true axes, from the one that a recording states.
+
+        It is stated in the recorded frame, like the key points. A direction that is that of the
+        model as it stands, and would not be if it were turned, was stated in the true frame.
+        """
+        if stated is None or self.rotation is None:
+            return stated
+        turned = self.rotation @ stated
+        model = self.gravity
+        if model is not None and angle_deg(model, stated) <= SAME_DEG < angle_deg(model, turned):
+            return stated
+        return turned
 
     def _on_time(self, recording: Recording) -> Recording:
         """Each row with the actuation that the log has at t + delay_s."""

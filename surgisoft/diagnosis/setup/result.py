@@ -331,6 +331,7 @@ class _Report:
             origin_mm=shift if turned and shift.any() else None,
             delay_s=-given.later_s,
             time_factor=self.search.time_factor,
+            gravity=self.model.spec.gravity,
         )
 
     def _instructions(self, correction: Correction) -> tuple[str, bool]:

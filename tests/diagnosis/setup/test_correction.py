@@ -81,6 +81,28 @@ def test_the_lines_of_the_map_mend_like_apply(name, tmp_path):
     assert find_setup_faults(default_arm(), [part.recording]) is None
 
 
+@pytest.mark.parametrize(
+    ("of_model", "expected"),
+    [
+        (None, [0.0, 1.0, 0.0]),
+        ((0.0, 1.0, 0.0), [0.0, 1.0, 0.0]),
+        ((0.0, 0.0, 1.0), [0.0, 1.0, 0.0]),
+        ((1.0, 0.0, 0.0), [1.0, 0.0, 0.0]),
+    ],
+)
+def test_stated_gravity_is_turned_with_the_key_points(of_model, expected):
+    """A quarter turn about z takes x to y. A direction that is the model's as stated stays."""
+    given = replace(measured(50), gravity=np.array([1.0, 0.0, 0.0]))
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    correction = Correction(
+        Arrangement.as_recorded(3), tuple(range(5)), "kPa", "kPa", rotation=turn, gravity=of_model
+    )
+    found = correction.applied(given)
+    np.testing.assert_allclose(found.gravity, expected, atol=1e-12)
+    x, y, z = np.moveaxis(given.key_points_mm, -1, 0)
+    np.testing.assert_allclose(found.key_points_mm, np.stack([-y, x, z], -1), atol=1e-12)
+
+
 def test_an_origin_in_metres_is_as_fine_as_one_in_millimetres():
     same, origin = Arrangement.as_recorded(3), np.array([12.3456, 0.0, -98.7654])
     correction = Correction(

@@ -109,6 +109,22 @@ def _openblas(module: str) -> tuple[Callable[[int], object], Callable[[], int]] 
         return None
 
 
+def check_processes(processes: int, cluster: str | None = None) -> None:
+    """Raise InputError where several processes are asked for and a cluster does the work.
+
+    cluster: see `workers`.
+    """
+    address = cluster or os.environ.get(CLUSTER)
+    if processes == 1 or not address:
+        return
+    source = "--cluster" if cluster else f"the environment variable {CLUSTER}"
+    unset = "" if cluster else ", or unset the variable"
+    raise InputError(
+        f"--processes {processes} has no effect: the workers of {address}, by {source}, do the "
+        f"work; leave --processes out{unset}"
+    )
+
+
 @contextlib.contextmanager
 def workers(
     processes: int, prepare: Callable[[], object] | None = None, cluster: str | None = None

@@ -73,25 +73,29 @@ def run(
     from surgisoft.agents.on_rig import rigs_in
     from surgisoft.experiments.page import markdown
     from surgisoft.experiments.session import finish_experiment, start_experiment
+    from surgisoft.workers import check_processes
 
     check_folder(output)
+    check_processes(processes, cluster)
     context = read_context(credibility)
     if context is not None:
         from surgisoft.credibility.of_experiment import check_context
         from surgisoft.experiments.session import open_experiment
 
         check_context(context, open_experiment(file))
-    spec, folder = start_experiment(
-        file,
-        output,
-        policy or (),
-        repeats,
-        rigs_in(rig or ""),
-        preflight=preflight,
-        resume=resume,
-        force=force,
-        cluster=cluster,
-    )
+    with progress("experiment check") as report:
+        spec, folder = start_experiment(
+            file,
+            output,
+            policy or (),
+            repeats,
+            rigs_in(rig or ""),
+            preflight=preflight,
+            resume=resume,
+            force=force,
+            cluster=cluster,
+            progress=report,
+        )
     with progress(f"experiment {spec.name}") as report:
         about = f"surgisoft experiment run {typed(file.name)}"
         try:
@@ -134,7 +138,8 @@ def check(
 
     spec = open_experiment(file)
     found = settings(spec)
-    clear_mm = check_playable(spec)
+    with progress("experiment check") as report:
+        clear_mm = check_playable(spec, progress=report)
     episodes = counted(len(found) * spec.repeats, "episode")
     print(
         f"{spec.name} ({spec.scenario}): {counted(len(found), 'setting')}, {episodes} of at most "

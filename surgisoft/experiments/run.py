@@ -50,7 +50,7 @@ from surgisoft.surrogate.code import name_code, named_code
 from surgisoft.tasks.episodes.file import save_episode
 from surgisoft.tasks.episodes.log import EpisodeLog
 from surgisoft.tasks.supervision import Row
-from surgisoft.workers import CLUSTER, torch_threads, workers
+from surgisoft.workers import CLUSTER, check_processes, torch_threads, workers
 
 DROPPED = ("phase", "reason", "reason_phase", "beam", "beam_unsafe", "safe")
 """Measures of single steps whose means mean nothing."""
@@ -103,11 +103,13 @@ def open_results(
     resume: bool = False,
     force: bool = False,
     cluster: str | None = None,
+    progress: Progress = silent,
 ) -> None:
     """Make the folder of results, or check that it holds results of this experiment.
 
-    Raises InputError, before anything is written, where a bench that is to be used cannot be
-    opened. cluster: see `run_experiment`; the benches are then those of its workers.
+    Raises InputError, before anything is written, where a setting that has no results yet cannot
+    be built, or a bench that is to be used cannot be opened. cluster: see `run_experiment`; the
+    benches are then those of its workers. progress: called with the settings that were built.
     """
     remote = bool(cluster or os.environ.get(CLUSTER))
     there = (folder / FILE).is_file()
@@ -122,6 +124,7 @@ def open_results(
                 "folder, or --force to start again"
             )
         _check_scene(spec, folder)
+        check_playable(spec, folder, progress)
         if not remote:
             check_benches(spec, folder)
         return
@@ -134,7 +137,7 @@ def open_results(
             raise InputError(
                 f"{folder}: results already exist; --resume continues them, --force replaces them"
             )
-    check_playable(spec)
+    check_playable(spec, progress=progress)
     if not remote:
         check_benches(spec)
     about: dict[str, object] = {"versions": versions()}
@@ -159,15 +162,24 @@ def _check_scene(spec: Experiment, folder: Path) -> None:
         )
 
 
-def check_playable(spec: Experiment) -> float:
+def check_playable(
+    spec: Experiment, folder: Path | None = None, progress: Progress = silent
+) -> float:
     """Raise an InputError unless the task and the controllers of every setting can be built.
 
     A case on a rig that may be real is built in simulation, where observations and actions are the
-    same; `check_benches` opens the rig. Returns the clearance below which the beam is off, mm: the
-    larger of the file's and the scene's.
+    same; `check_benches` opens the rig. folder: results that are continued; a setting whose
+    episodes are all there needs not be built any more. progress: called with the settings that were
+    built, of those that differ. Returns the clearance below which the beam is off, mm: the larger
+    of the file's and the scene's.
     """
     found, clear_mm = settings(spec), 0.0
-    for built, setting in {_as_built(spec, setting): setting for setting in found}.items():
+    if folder:
+        left = {job.setting.number for job in jobs(spec) if not _is_done(folder, job)}
+        found = [setting for setting in found if setting.number in left]
+    different = {_as_built(spec, setting): setting for setting in found}
+    for number, (built, setting) in enumerate(different.items()):
+        progress(number, len(different), setting.words)
         try:
             task = build_task(spec, built, on_warning=None)  # the run warns
             PhaseControllers(spec, task, built.case.policy)
@@ -241,6 +253,7 @@ def run_experiment(
                 warned.add(text)
                 on_warning(text)
 
+    check_processes(processes, cluster)
     every = jobs(spec)
     left = [job for job in every if not _is_done(folder, job)]
     total = float(sum(job.count for job in every))

@@ -165,6 +165,7 @@ def start_experiment(
     resume: bool = False,
     force: bool = False,
     cluster: str | None = None,
+    progress: Progress = silent,
 ) -> tuple[Experiment, Path]:
     """The experiment and its folder of results, new or ready to be resumed.
 
@@ -172,7 +173,8 @@ def start_experiment(
     repeats: episodes of each setting. rigs: in place of those of the cases on rigs. preflight:
     whether real ones have to move as their models predict before each setting. resume:
     continue existing results; force: replace them. cluster: see `finish_experiment`; without one,
-    benches that may be real are opened once and given back before anything is written.
+    benches that may be real are opened once and given back before anything is written. progress:
+    called with the settings that were checked.
     """
     if resume and force:
         raise InputError("--resume continues results, --force replaces them: give one of the two")
@@ -187,7 +189,7 @@ def start_experiment(
         settings(spec)
     spec = spec if repeats is None else replace(spec, repeats=repeats)
     place = Path(output) if output else Path("results") / spec.name
-    open_results(spec, place, resume, force, cluster)
+    open_results(spec, place, resume, force, cluster, progress)
     return spec, place
 
 

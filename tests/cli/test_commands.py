@@ -457,9 +457,10 @@ def test_an_interrupted_experiment_says_how_to_go_on(tmp_path, monkeypatch, caps
     plain = f"continue with: surgisoft experiment run liver -o {tmp_path} --resume"
     assert capsys.readouterr().out.rstrip().endswith(plain)
     given = "--policy ring runs/a --repeats 2 --rig 'laser=x endoscope=y' --preflight"
-    given += " --processes 2 --cluster tcp://a:1 --no-replays"
-    assert run(["experiment", "run", "liver", *shlex.split(given)]) == 130
-    assert capsys.readouterr().out.rstrip().endswith(f"{plain} {given}")
+    for where in ("--processes 2", "--cluster tcp://a:1"):
+        options = f"{given} {where} --no-replays"
+        assert run(["experiment", "run", "liver", *shlex.split(options)]) == 130
+        assert capsys.readouterr().out.rstrip().endswith(f"{plain} {options}")
 
 
 def test_a_command_leaves_the_function_of_commands_in_place(capsys):

@@ -19,7 +19,7 @@ from surgisoft.experiments.controllers import PhaseControllers, Schedule
 from surgisoft.experiments.phases import PhasedTask, with_phase_events
 from surgisoft.experiments.pictures import film
 from surgisoft.experiments.plan import build_task, rig_config, scene_of, settings
-from surgisoft.experiments.run import jobs, open_results, read_rows, row_file
+from surgisoft.experiments.run import jobs, open_results, read_rows, row_file, run_experiment
 from surgisoft.experiments.session import (
     experiments_of,
     start_experiment,
@@ -267,6 +267,40 @@ def test_results_go_on_only_with_their_own_scene(tmp_path):
         open_results(spec, folder, resume=True)
     with pytest.raises(InputError, match="exists and holds no results of an experiment"):
         open_results(spec, tmp_path)
+
+
+def test_settings_that_are_left_are_built_before_results_go_on(tmp_path):
+    """A policy without weights is one line before the first run, unless its episodes are there."""
+    shipped = next(path for path in PACKAGED.iterdir() if (path / "config.json").is_file())
+    learned = tmp_path / "learned"
+    shutil.copytree(shipped, learned)
+    spec, told = with_policy(spec_of(tmp_path), learned), []
+    open_results(spec, tmp_path / "r", progress=lambda *given: told.append(given[:2]))
+    assert told == [(0, 2), (1, 2)]
+    shutil.rmtree(learned / "checkpoints")
+    with pytest.raises(InputError, match="setting '.*learned': .*checkpoints"):
+        open_results(spec, tmp_path / "r", resume=True)
+    for job in jobs(spec):
+        if job.setting.case.policy == str(learned):
+            for episode in range(job.first, job.first + job.count):
+                write_json(row_file(tmp_path / "r", job.setting, episode), {})
+    open_results(spec, tmp_path / "r", resume=True)
+
+
+def test_processes_beside_a_cluster_are_refused(tmp_path, monkeypatch, capsys):
+    file, out = write(tmp_path), tmp_path / "out"
+    given = ["experiment", "run", str(file), "-o", str(out), "--processes", "2"]
+    assert run([*given, "--cluster", "tcp://host:8786"]) == 2
+    assert capsys.readouterr().err == (
+        "surgisoft: error: --processes 2 has no effect: the workers of tcp://host:8786, by "
+        "--cluster, do the work; leave --processes out\n"
+    )
+    monkeypatch.setenv("SURGISOFT_CLUSTER", "tcp://other:8786")
+    assert run(given) == 2
+    assert "of tcp://other:8786, by the environment variable" in capsys.readouterr().err
+    with pytest.raises(InputError, match="--processes 2 has no effect"):
+        run_experiment(spec_of(tmp_path), out, processes=2, cluster="tcp://host:8786")
+    assert not out.exists()
 
 
 @pytest.mark.parametrize(

@@ -104,7 +104,12 @@ class TrackBody:
         self.world = level_world(c.world, c.mean_kPa, c.arm, device)
         self.dt_s, self.weights = c.world.dt_s, {"arm": c.weights}
         self.approach = round(c.approach_s / self.dt_s)
-        self.steps = self.approach + round(c.time_s / self.dt_s)
+        moving = round(c.time_s / self.dt_s)
+        if not moving:
+            raise InputError(
+                f"track_body: time_s is {c.time_s:g} s, expected at least a step, {self.dt_s:g} s"
+            )
+        self.steps = self.approach + moving
         row: dict[str, Any] = {"dtype": torch.float32, "device": self.world.device}
         self._pace = torch.tensor([1.0 / c.slow_s, 1.0 / c.fast_s], **row)[:, None]
         self._swing = c.swing_kPa * torch.tensor(WAVE_SHARES, **row)[:, None]

@@ -601,6 +601,15 @@ def test_the_fine_term_has_its_own_scale():
     torch.testing.assert_close(reward["fine"], torch.exp(-error / near))
 
 
+def test_a_reference_moves_for_a_step_at_least():
+    """The step is 0.1 s. Less than half of one was rounded to none, which left the approach."""
+    config = with_fields(config_of("track_body"), time_s=0.04)
+    message = "track_body: time_s is 0.04 s, expected at least a step, 0.1 s"
+    with pytest.raises(InputError, match=re.escape(message)):
+        make_task("track_body", config)
+    assert make_task("track_body", with_fields(config, time_s=0.1, approach_s=0.0)).steps == 1
+
+
 @pytest.mark.parametrize("change", [{"loop_s": 1e308}, {"loops": 2**62}])
 def test_an_episode_without_end_is_one_line(change):
     """As a damaged config.json of a training run asks for it."""

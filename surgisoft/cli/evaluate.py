@@ -108,9 +108,12 @@ def evaluate(
     """Evaluate policies on the same episodes of a task, with 95 % intervals.
 
     Ctrl-C keeps what is finished: policies, and batches of 256 episodes (on a real rig, episodes).
+    --replay FILE.rrd writes the first episode; of several policies one FILE-POLICY.rrd each.
     """
     check_free(json_file, "policies", "drivers")
-    check_replay(replay)
+    replays = _replays(policies, replay)
+    for path in replays.values():
+        check_replay(path)
     check_folder(report)
     on = on or (PLACES[1] if rig else PLACES[0])
     rigs = _rig_config(on, rig, robot_seed, hidden, cameras, observer_gain, preflight)
@@ -138,7 +141,7 @@ def evaluate(
                 scene=scene,
                 config=config,
                 rules=laid,
-                log=policies if report else policies[:1] if replay else (),
+                log=policies if report or replay else (),
             )
         except Interrupted as ended:
             found = ended.result
@@ -150,11 +153,13 @@ def evaluate(
     if json_file:
         write_json(json_file, found.to_json())
         written.append(json_file)
-    if replay:
+    for name, path in replays.items():
+        if name not in found.logs:
+            continue
         from surgisoft.replay.episode_view import write_replay
 
         with progress("replay") as report_progress:
-            written.append(write_replay(found.logs[policies[0]], replay, report=report_progress))
+            written.append(write_replay(found.logs[name], path, report=report_progress))
     if report:
         from surgisoft.agents.report import evaluation_page
         from surgisoft.experiments.pictures import film
@@ -175,6 +180,22 @@ def evaluate(
     show_written(written)
     if found.interrupted:
         raise typer.Exit(INTERRUPTED)
+
+
+def _replays(policies: list[str], replay: Path | None) -> dict[str, Path]:
+    """Policy -> the file of its replay: the given one, or NAME-POLICY.rrd of several policies."""
+    names = list(dict.fromkeys(policies))
+    if replay is None:
+        return {}
+    if len(names) == 1:
+        return {names[0]: replay}
+    found: dict[str, Path] = {}
+    for name in names:
+        path = replay.with_name(f"{replay.stem}-{Path(name).name or 'run'}{replay.suffix}")
+        if path in found.values():  # runs of one name in two folders
+            path = path.with_stem(f"{path.stem}-{len(found) + 1}")
+        found[name] = path
+    return found
 
 
 def _rig_config(

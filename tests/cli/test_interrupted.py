@@ -222,7 +222,7 @@ def test_ctrl_c_in_evaluate_keeps_the_finished_policies(tmp_path, monkeypatch, c
     assert words in error
     assert words in out
     assert words in (tmp_path / "page" / "report.html").read_text(encoding="utf-8")
-    assert (tmp_path / "r.rrd").is_file()
+    assert [path.name for path in tmp_path.glob("*.rrd")] == ["r-scripted.rrd"]
 
 
 @pytest.mark.parametrize(

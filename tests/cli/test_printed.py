@@ -893,6 +893,38 @@ def test_after_an_amendment_the_advice_keeps_what_is_known_of_the_model(
     ]  # fmt: skip
 
 
+def test_each_policy_has_a_replay_of_its_own(tmp_path, capsys, monkeypatch):
+    """Two runs of one name in two folders, too; one policy alone has the file that was named."""
+    asked: list[tuple] = []
+
+    def evaluated(policies, *_, log, **__):
+        asked.append(log)
+        return SimpleNamespace(
+            request=SimpleNamespace(seed=0), interrupted="", task="track_circle", results=(),
+            logs={name: f"log of {name}" for name in log}, success_rule="", measured_arms=(),
+        )  # fmt: skip
+
+    made: dict[str, str] = {}
+    monkeypatch.setattr("surgisoft.agents.session.evaluate", evaluated)
+    monkeypatch.setattr(
+        "surgisoft.replay.episode_view.write_replay",
+        lambda log, path, report: made.update({path.name: log}) or path,
+    )
+    file = str(tmp_path / "r.v2.rrd")
+    names = ["scripted", "a/run", "b/run"]
+    assert run(["evaluate", *names, "--task", "track_circle", "--replay", file]) == 0
+    assert asked == [names]
+    assert made == {
+        "r.v2-scripted.rrd": "log of scripted",
+        "r.v2-run.rrd": "log of a/run",
+        "r.v2-run-3.rrd": "log of b/run",
+    }
+    assert f"wrote {tmp_path / 'r.v2-run-3.rrd'}" in capsys.readouterr().out
+    made.clear()
+    assert run(["evaluate", "scripted", "--task", "track_circle", "--replay", file]) == 0
+    assert made == {"r.v2.rrd": "log of scripted"}
+
+
 def test_printed_commands_quote_paths_with_spaces(spaced, capsys, monkeypatch):
     folder = Path(spaced).parent
     new = str(folder / "new arm")

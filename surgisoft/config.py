@@ -302,13 +302,20 @@ def _short(text: str, most: int = 100) -> str:
 
 
 def describe(value: object) -> str:
-    """A value as text, short enough for one line of a message."""
+    """A value with its type as text, short enough for one line of a message."""
     names = {bool: "boolean", int: "integer", float: "number", str: "text"}
+    if isinstance(value, dict):
+        return value_text(value)
+    kind = names.get(type(value), "a list" if isinstance(value, list) else "value")
+    return f"{kind} {value_text(value)}"
+
+
+def value_text(value: object) -> str:
+    """A value as text, short enough for one line of a message: 0, 'kPa', true, [1, 2]."""
     if isinstance(value, dict):
         return "a table"
     text = _REPR.repr(value) if not isinstance(value, bool) else str(value).lower()
-    kind = names.get(type(value), "a list" if isinstance(value, list) else "value")
-    return f"{kind} {_short(text, 60)}"
+    return _short(text, 60)
 
 
 def expectation(hint: typing.Any) -> str:

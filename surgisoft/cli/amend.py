@@ -28,9 +28,9 @@ from surgisoft.cli.options import (
     Replay,
     Report,
     before_options,
+    complete_effects,
     given_options,
     model_options,
-    complete_effects,
     with_effect_files,
 )
 from surgisoft.cli.progress import progress

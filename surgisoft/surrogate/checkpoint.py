@@ -13,7 +13,7 @@ from safetensors.torch import save as safetensors_bytes
 from torch import Tensor
 
 from surgisoft import __version__
-from surgisoft.config import Where, describe, from_table
+from surgisoft.config import Where, from_table, value_text
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.files import new_folder, read_json, resolved
 from surgisoft.surrogate.arm import ArmSpec
@@ -235,7 +235,7 @@ def load_model(
         weights = load_file(folder / "weights.safetensors")
         if config["format"] != FORMAT:
             raise InputError(
-                f"{folder}: model format {describe(config['format'])}, expected {FORMAT}; fit it "
+                f"{folder}: model format {value_text(config['format'])}, expected {FORMAT}; fit it "
                 "again"
             )
         _check_finite(folder, weights)

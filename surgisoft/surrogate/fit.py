@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from scipy.special import stdtrit
 from torch import Tensor
 
-from surgisoft.config import describe
+from surgisoft.config import value_text
 from surgisoft.errors import InputError, Interrupted, unknown_name
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.chain import Taps
@@ -593,24 +593,24 @@ def check_config(config: FitConfig) -> None:
         whole = isinstance(value, Integral) and not isinstance(value, bool)
         if not whole or not least <= value <= most:
             raise InputError(
-                f"'{name}' of a fit is {describe(value)}, expected a whole number from {least} "
+                f"'{name}' of a fit is {value_text(value)}, expected a whole number from {least} "
                 f"to {most}"
             )
     rate = config.learning_rate
     if not (isinstance(rate, Real) and 0 < rate < math.inf) or isinstance(rate, bool):
         raise InputError(
-            f"'learning_rate' of a fit is {describe(rate)}, expected a finite number above 0"
+            f"'learning_rate' of a fit is {value_text(rate)}, expected a finite number above 0"
         )
     if not isinstance(config.check_excitation, bool):
         raise InputError(
-            f"'check_excitation' of a fit is {describe(config.check_excitation)}, expected a "
+            f"'check_excitation' of a fit is {value_text(config.check_excitation)}, expected a "
             "boolean"
         )
     check_widths(config.hidden)
     effects = config.effects
     if not isinstance(effects, tuple | list) or not all(isinstance(x, str) for x in effects):
         raise InputError(
-            f"'effects' of a fit is {describe(effects)}, expected names of effects, such as "
+            f"'effects' of a fit is {value_text(effects)}, expected names of effects, such as "
             "['hysteresis']"
         )
     _check_network(config)

@@ -12,7 +12,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from surgisoft.config import describe
+from surgisoft.config import value_text
 from surgisoft.errors import InputError
 from surgisoft.surrogate.arm import centre_and_half
 from surgisoft.surrogate.history import History
@@ -45,7 +45,7 @@ def check_widths(widths: object, shown: str | None = None) -> None:
     each = list(widths) if isinstance(widths, tuple | list) else []
     if not 1 <= len(each) <= MOST_LAYERS or not all(map(_fits, each)):
         raise InputError(
-            f"hidden widths {shown or describe(widths)}: expected whole numbers such as "
+            f"hidden widths {shown or value_text(widths)}: expected whole numbers such as "
             f"128,128,128,128, 1 to {MOST_LAYERS} of them from 1 to {MOST_WIDTH}"
         )
 

@@ -883,7 +883,18 @@ def test_after_an_amendment_the_advice_keeps_what_is_known_of_the_model(
     given = ["--model-error", "0.5", "--refit", "never"]
 
     def last(*more: str) -> list[str]:
-        command = ["amend", "default", "--data", spaced, "--effect", "creep", *more, *given, "-o", new]
+        command = [
+            "amend",
+            "default",
+            "--data",
+            spaced,
+            "--effect",
+            "creep",
+            *more,
+            *given,
+            "-o",
+            new,
+        ]
         assert run(command) == 0
         return words_of(capsys.readouterr().out.splitlines()[-1])
 

@@ -140,7 +140,11 @@ MAPS = [
         "commanded.repeated: got text 'interpolate'; expected \"keep\": a command is held",
     ),
     ('unit = "kPa"', 'unit = "kPa"\noptional = true', "optional: got true; expected none beside"),
-    ('columns = ["u"]\nunit = "kPa"', "optional = true", "optional: got true; expected none: every"),
+    (
+        'columns = ["u"]\nunit = "kPa"',
+        "optional = true",
+        "optional: got true; expected none: every",
+    ),
 ]
 
 RAW = "t,u,x,y,z\n0,1,2,3,4\n1,2,3,4,5\n"

@@ -180,7 +180,7 @@ SAMPLE = '{head}\n{"row":0,"run":RUN,"t_s":0,"p":[1],"k":[[0,0,0]]}\n{}\n'
         ('{"format": "surgisoft recording log", "version": 1}\n', "name: missing; expected text"),
         (
             '{head}\n{"row":0,"run":1e400,"t_s":0,"p":[1],"k":[[0,0,0]]}\n{}\n',
-            "'run' is number inf",
+            "'run' is inf",
         ),
         (
             '{head}\n{"row":0,"run":0,"t_s":0,"p":[9' + "9" * 400 + '],"k":[[0,0,0]]}\n{}\n',
@@ -189,10 +189,10 @@ SAMPLE = '{head}\n{"row":0,"run":RUN,"t_s":0,"p":[1],"k":[[0,0,0]]}\n{}\n'
         ('{"a":' * 100_000 + "\n{}\n", "line 1: not a line of"),
         ("{head}" + "\n" + "[" * 100_000 + "\n{}\n", "line 2: not a line of"),
         ("{head}\n", "the log has no sample yet"),
-        ('{head}\n{"row": 0}\n{"row": 1}\n', "line 2: 'run' is value None, expected"),
+        ('{head}\n{"row": 0}\n{"row": 1}\n', "line 2: 'run' is None, expected"),
         (
             '{head}\n{"row":0,"run":0,"t_s":0,"p":[1,2],"k":[[0,0,0]]}\n{}\n',
-            r"line 2: 'p' is a list \[1, 2\], expected numbers of shape \(1,\)",
+            r"line 2: 'p' is \[1, 2\], expected numbers of shape \(1,\)",
         ),
         ("{head}\nx\n{}\n", "line 2: not a line of a surgisoft recording log"),
     ],

@@ -37,7 +37,7 @@ def test_weights_that_are_not_finite_are_refused(folder, value, last):
         (("arm", "low"), [0.0, 0.0, float("nan")], r"arm.low\[2\]: got nan"),
         (("arm", "chambers"), "3", "arm.chambers: got text '3'; expected an integer"),
         (("validation", "rmse_mm"), "small", "rmse_mm: got text 'small'"),
-        (("format",), "\x1b[2J", r"model format text '\\x1b"),
+        (("format",), "\x1b[2J", r"model format '\\x1b"),
     ],
 )
 def test_a_config_that_does_not_fit_is_one_line(folder, path, value, said):

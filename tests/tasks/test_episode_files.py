@@ -188,7 +188,7 @@ def test_an_archive_that_unpacks_to_gigabytes_is_refused(members, tmp_path):
         ),
         (("log", "table", "arms", "table", "laser", "table", "tool"), "knife", "unknown tool"),
         (("log", "table", "dt_s"), 10**400, "'dt_s' of the log is not a number"),
-        (("format",), "\x1b[2J", r"format text '\\x1b\[2J', expected"),
+        (("format",), "\x1b[2J", r"format '\\x1b\[2J', expected"),
     ],
 )
 def test_a_table_with_another_value_is_refused(members, tmp_path, path, value, said):

@@ -21,7 +21,7 @@ from typing import Annotated, Any, TextIO
 import numpy as np
 
 from surgisoft.command_line import typed
-from surgisoft.config import Where, at_least, describe, from_table
+from surgisoft.config import Where, at_least, from_table, value_text
 from surgisoft.errors import InputError
 from surgisoft.files import json_safe
 from surgisoft.measurement.recordings.recording import (
@@ -314,7 +314,7 @@ def _check_sample(path: Path, number: int, line: dict, header: LogHeader) -> Non
             good = good and type(line[name]) is int and abs(line[name]) < 2**53
         if not good:
             raise InputError(
-                f"{path}, line {number}: '{name}' is {describe(line.get(name))}, expected "
+                f"{path}, line {number}: '{name}' is {value_text(line.get(name))}, expected "
                 f"numbers of shape {shape}"
             )
 

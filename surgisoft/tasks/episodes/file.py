@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from surgisoft.config import describe
+from surgisoft.config import value_text
 from surgisoft.errors import InputError
 from surgisoft.files import write_atomically
 from surgisoft.tasks.episodes.consistency import contradiction
@@ -68,7 +68,7 @@ def load_episode(path: str | Path) -> EpisodeLog:
         table = json.loads(arrays.pop("table").tobytes())
         version = table["format"]
         if version not in (FORMAT, SECOND_FORMAT, FIRST_FORMAT):
-            raise InputError(f"{path}: format {describe(version)}, expected '{FORMAT}'")
+            raise InputError(f"{path}: format {value_text(version)}, expected '{FORMAT}'")
         joined = _joined(table["log"], arrays)
         log = _log(_present(joined, version))
     except InputError:

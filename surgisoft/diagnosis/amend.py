@@ -463,7 +463,7 @@ def fall_of(before: Problem, after: Problem, p_value: float | None = None) -> Fa
     return Fall(
         before=rmse[0],
         after=rmse[1],
-        floor=before.floor_mm,
+        floor=before.told_floor_mm,
         fall=rmse[0] - rmse[1],
         ci95=(float(low), float(high)),
         rows=len(before.index),

@@ -600,7 +600,7 @@ def without_before(both: BeforeAfter) -> Diagnosis:
     head = f"since {both.names}: cannot tell what is missing, if anything"
     return Diagnosis(
         verdict=Verdict("cannot_tell", (), f"{head}: {both.strange_in_words}", reason="before"),
-        error_mm=ErrorLevels(problem.rmse_mm, problem.floor_mm, best.rmse_mm),
+        error_mm=ErrorLevels(problem.rmse_mm, problem.told_floor_mm, best.rmse_mm),
         ranking=(),
         next_command="surgisoft diagnose {model} {data}",
         change=both.change,
@@ -630,7 +630,7 @@ def lacking_before(both: BeforeAfter, report: Progress) -> tuple[str, ...]:
     command = "surgisoft improve --refit always" if together else "surgisoft improve"
     return (
         f"the model already lacks {named} on the recordings from before the change (error "
-        f"{problem.rmse_mm:.3g} mm, floor {floor_in_words(problem.floor_mm, '.3g')}), so the "
+        f"{problem.rmse_mm:.3g} mm, floor {floor_in_words(problem.told_floor_mm, '.3g')}), so the "
         "parameters of what has changed may be off by more than their intervals say: first run "
         f"'{command}' on the model and {both.names}, then amend the model that it writes",
     )
@@ -753,7 +753,7 @@ def result_of(
     kind, effects, sure = decision.kind, decision.effects, decision.confidence
     levels = ErrorLevels(
         problem.rmse_mm,
-        problem.floor_mm,
+        problem.told_floor_mm,
         best.rmse_mm,
         validated=None if evidence.paired else problem.rmse_mm / evidence.error_over_validated,
         discrepancy_alone=found.selection.rmse_mm(found.selection.losses()),

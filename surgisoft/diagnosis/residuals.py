@@ -81,8 +81,17 @@ UNKNOWN = Floor(None, "unknown")
 
 def floor_in_words(floor_mm: float, digits: str) -> str:
     """A noise floor [mm] in words, its number in the format `digits`; `unknown` for the least noise
-    that is reckoned with, which stands for noise that nothing shows, or hardly any."""
-    return f"{floor_mm:{digits}} mm" if floor_mm > LEAST_NOISE_MM else "unknown"
+    that is reckoned with, which stands for noise that nothing shows, see `floor_to_tell`."""
+    return "unknown" if 0.0 < floor_mm <= LEAST_NOISE_MM else f"{floor_mm:{digits}} mm"
+
+
+def floor_to_tell(noise_mm: np.ndarray, source: str) -> float:
+    """RMS noise over all key points [mm] from that of each, (n,), as `noise_of` gives it.
+
+    0 for noise that is known, as from a sidecar, to be less than is reckoned with (LEAST_NOISE_MM).
+    """
+    floor_mm = float(np.sqrt(np.mean(noise_mm**2)))
+    return 0.0 if source != "unknown" and floor_mm <= LEAST_NOISE_MM else floor_mm
 
 
 def noise_of(recordings: list[Recording]) -> tuple[np.ndarray, str]:
@@ -161,7 +170,7 @@ def _differences(columns: Sequence[np.ndarray], run: Sequence[np.ndarray], lag: 
 
 def _floor_of(noise_mm: np.ndarray, source: str) -> Floor:
     """The floor over all key points from the noise (n,) of each."""
-    return Floor(float(np.sqrt(np.mean(noise_mm**2))), source) if source != "unknown" else UNKNOWN
+    return Floor(floor_to_tell(noise_mm, source), source) if source != "unknown" else UNKNOWN
 
 
 def _stated_floor(recordings: list[Recording]) -> Floor:
@@ -590,8 +599,13 @@ class Problem:
 
     @property
     def floor_mm(self) -> float:
-        """RMS noise over all key points, mm."""
+        """RMS noise over all key points that is reckoned with, mm: `LEAST_NOISE_MM` at least."""
         return float(np.sqrt(np.mean(self.noise_mm**2)))
+
+    @property
+    def told_floor_mm(self) -> float:
+        """The same as it is told, mm, see `floor_to_tell`."""
+        return floor_to_tell(self.noise_mm, self.table.floor.source)
 
     @property
     def covered_s(self) -> float | None:

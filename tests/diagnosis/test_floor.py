@@ -5,9 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from surgisoft.diagnosis.amend import fall_of
 from surgisoft.diagnosis.data_quality import data_quality_warnings
 from surgisoft.diagnosis.residuals import (
+    Floor,
     floor_in_words,
+    floor_to_tell,
     held_out_rows,
     noise_of,
     problem_of,
@@ -181,3 +184,19 @@ def test_a_motion_without_noise_keeps_a_tenth_of_it():
 def test_a_floor_in_words():
     assert floor_in_words(1e-4, ".3f") == "unknown"
     assert floor_in_words(0.25, ".3f") == "0.250 mm"
+    assert floor_in_words(0.0, ".3f") == "0.000 mm"
+
+
+@pytest.mark.parametrize("kind", ["continuous", "settled"])
+def test_stated_noise_of_zero_is_none(kind):
+    """It is told as 0 and reckoned with as the least noise; without a statement it is unknown."""
+    made = replace(recording(np.zeros(600), walk(600), noise_mm=0.0), kind=kind)
+    problem = residual_table(still_model(), [made]).view("training")
+    assert problem.table.floor == Floor(0.0, "sidecar")
+    assert problem.told_floor_mm == 0.0
+    assert problem.floor_mm == pytest.approx(1e-4)
+    assert fall_of(problem, problem).floor == 0.0
+    same = np.broadcast_to(made.key_points_mm[:1], made.key_points_mm.shape)
+    noise, source = noise_of([replace(made, noise_mm=None, key_points_mm=same)])
+    assert source == "unknown"
+    assert floor_in_words(floor_to_tell(noise, source), ".3f") == "unknown"

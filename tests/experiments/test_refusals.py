@@ -278,7 +278,7 @@ def test_settings_that_are_left_are_built_before_results_go_on(tmp_path):
     open_results(spec, tmp_path / "r", progress=lambda *given: told.append(given[:2]))
     assert told == [(0, 2), (1, 2)]
     shutil.rmtree(learned / "checkpoints")
-    with pytest.raises(InputError, match="setting '.*learned': .*checkpoints"):
+    with pytest.raises(InputError, match=r"setting '.*learned': .*checkpoints"):
         open_results(spec, tmp_path / "r", resume=True)
     for job in jobs(spec):
         if job.setting.case.policy == str(learned):

@@ -7,7 +7,13 @@ from typing import Any
 import numpy as np
 
 from surgisoft.diagnosis.other_models import has_slope
-from surgisoft.diagnosis.residuals import EVERY_ROW, fit_of_model, model_discrepancy, noise_of
+from surgisoft.diagnosis.residuals import (
+    EVERY_ROW,
+    fit_of_model,
+    floor_to_tell,
+    model_discrepancy,
+    noise_of,
+)
 from surgisoft.diagnosis.setup.alignment import HANDED, Frame, angle, shifted
 from surgisoft.diagnosis.setup.arrangements import mistaken
 from surgisoft.diagnosis.setup.blind import Blind, blind_channel
@@ -163,9 +169,13 @@ def _called(recordings: Sequence[Recording]) -> list[str]:
 
 def _levels(model: ArmModel, recordings: list[Recording]) -> Levels:
     """The levels that errors of a model on recordings are compared with."""
-    noise, _ = noise_of(recordings)
+    noise, source = noise_of(recordings)
     discrepancy = model_discrepancy(model, noise)
-    return Levels(float(np.sqrt(np.mean(noise**2))), float(np.sqrt(np.mean(discrepancy**2))))
+    return Levels(
+        float(np.sqrt(np.mean(noise**2))),
+        float(np.sqrt(np.mean(discrepancy**2))),
+        floor_to_tell(noise, source),
+    )
 
 
 def _of_one_setup(model: ArmModel, recordings: list[Recording]) -> SetupResult | None:
@@ -267,7 +277,7 @@ class _Report:
             how_to_tell=SLOW_OR_WRONG if silent_model else _how_to_tell(faults, alternatives),
             before_mm=before,
             after_mm=after,
-            floor_mm=self.search.levels.noise,
+            floor_mm=self.search.levels.told_noise,
             recordings=tuple(recording.name for recording in self.recordings),
             correctable=correctable,
             correction=correction,

@@ -249,6 +249,8 @@ class Levels:
     """Noise of the measurement."""
     discrepancy: float
     """Validated error of the model, without its noise."""
+    told_noise: float = 0.0
+    """The noise as it is told, see `floor_to_tell`."""
 
     @property
     def reference(self) -> float:

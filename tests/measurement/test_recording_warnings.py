@@ -104,6 +104,56 @@ def test_no_false_alarm(kind, seed):
     assert find_warnings(CLEAN[kind](seed)) == []
 
 
+def appended(first, second):
+    """Two recordings as two runs of one, on their own clocks."""
+    run = np.repeat([3, 7], [first.samples, second.samples])
+    both = {
+        name: np.concatenate([getattr(first, name), getattr(second, name)])
+        for name in ("t_s", "measured", "key_points_mm", "commanded")
+    }
+    return dataclasses.replace(first, run=run, **both)
+
+
+def test_a_run_that_was_appended_twice_is_found():
+    clean = slow_and_noisy(1, samples=300)
+    lost = clean.key_points_mm.copy()
+    lost[40:60, 1] = np.nan
+    clean = dataclasses.replace(clean, key_points_mm=lost)
+    (found,) = find_warnings(appended(clean, clean))
+    assert found.sample == 300
+    assert found.text.startswith(
+        "300 of 600 rows equal earlier ones bit for bit, from here on those from sample 1 on: "
+    )
+    part = dataclasses.replace(
+        clean, **{n: getattr(clean, n)[100:150] for n in ("t_s", "run", "measured", "commanded")},
+        key_points_mm=lost[100:150],
+    )  # fmt: skip
+    (found,) = find_warnings(appended(clean, part))
+    assert found.text.startswith("50 of 350 rows equal earlier ones bit for bit, from here on tho")
+    assert "from sample 101 on" in found.text
+    assert find_warnings(appended(clean, slow_and_noisy(2, samples=300))) == []
+
+
+def test_an_arm_at_rest_repeats_its_rows():
+    """Coarse sensors give the same row again and again, before and after a motion."""
+    clean = slow_and_noisy(1, samples=300)
+    rest = dataclasses.replace(
+        clean, measured=0.0 * clean.measured, commanded=0.0 * clean.commanded,
+        key_points_mm=np.broadcast_to(clean.key_points_mm[:1], clean.key_points_mm.shape),
+    )  # fmt: skip
+    assert "equal earlier" not in " ".join(w.text for w in find_warnings(appended(rest, rest)))
+
+
+def test_copies_in_two_files_are_found(tmp_path):
+    clean, other, told = slow_and_noisy(1), slow_and_noisy(2), []
+    for name, made in (("a", clean), ("b", other), ("c", clean)):
+        save_recording(dataclasses.replace(made, name=name), tmp_path / f"{name}.csv")
+    load_recordings(tmp_path, on_warning=told.append)
+    a, c = tmp_path / "a.csv", tmp_path / "c.csv"
+    (text,) = told
+    assert text.startswith(f"{c}: 100% of its motion equals that of {a} bit for bit: copies count")
+
+
 @pytest.mark.parametrize("with_command", [True, False])
 @given(seed=st.integers(0, 2**32), start=st.integers(100, 900), length=st.integers(60, 250))
 def test_frozen_channel_is_found_with_its_place(with_command, seed, start, length):

@@ -16,7 +16,7 @@ from surgisoft.files import new_file, new_folder, resolved
 from surgisoft.measurement.recordings.columns import Layout, parse_header
 from surgisoft.measurement.recordings.log import SUFFIX as LOG_SUFFIX
 from surgisoft.measurement.recordings.log import read_log
-from surgisoft.measurement.recordings.quality import find_warnings
+from surgisoft.measurement.recordings.quality import copies_of_others, find_warnings
 from surgisoft.measurement.recordings.recording import (
     Recording,
     first_run_again,
@@ -58,7 +58,10 @@ def load_recordings(
         return [recording for part in read for recording in part]
     paths_only = [Path(item) for item in given if not isinstance(item, Recording)]
     files = _find(paths_only, on_warning or _warn)
-    return [load_recording(file, on_warning) for file in files]
+    found = [load_recording(file, on_warning) for file in files]
+    for text in copies_of_others(found):
+        (on_warning or _warn)(text)
+    return found
 
 
 def recording_files(paths: Iterable[str | Path] | str | Path) -> list[Path]:

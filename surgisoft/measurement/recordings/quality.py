@@ -43,6 +43,13 @@ STEADY_RATIO = 15.0
 """Robust standard deviations by which a steady-state key point is off that counts as a jump."""
 STEADY_SHARE = 0.1
 """The least deviation of a steady-state key point called a jump, as a share of its motion."""
+COPIED_ROWS = 20
+"""Shorter stretches that equal earlier rows are never called copies."""
+COPIED_CHANGES = 10
+"""Least number of these rows that differ from the row before: an arm at rest before coarse sensors
+gives the same row again."""
+MIX = np.uint64(0x9E3779B97F4A7C15)
+"""Odd number by which hashes of values are multiplied (2^64 over the golden ratio, Knuth 1973)."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +67,71 @@ def find_warnings(recording: Recording) -> list[QualityWarning]:
     jumps = _steady_state_jumps if recording.kind == "settled" else _continuous_jumps
     with np.errstate(over="ignore", invalid="ignore"):  # finite numbers of any size are read
         found = [*_frozen_channels(recording), *_frozen_key_points(recording), *jumps(recording)]
+    found += _copied_rows(recording)
     return sorted(found, key=lambda warning: warning.sample)
+
+
+# --- copies -------------------------------------------------------------------------------------
+
+
+def _stretch_hashes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Hash (S,) uint64 of each stretch of COPIED_ROWS rows, and whether it changes enough to count.
+
+    Of actuation and key points; times, and the numbers of runs, may differ between copies.
+    """
+    points = recording.key_points_mm.reshape(recording.samples, -1)
+    parts = [recording.measured, points]
+    parts += [] if recording.commanded is None else [recording.commanded]
+    row = np.zeros(recording.samples, np.uint64)
+    for column in np.concatenate(parts, axis=1).T:
+        value = np.where(np.isnan(column), np.nan, column + 0.0)  # one zero, one NaN
+        row = (row ^ value.view(np.uint64)) * MIX
+        row ^= row >> np.uint64(29)
+    count = max(recording.samples - COPIED_ROWS + 1, 0)
+    changed = np.cumsum(np.concatenate([[0], row[1:] != row[:-1]]))
+    stretch = np.zeros(count, np.uint64)
+    for k in range(COPIED_ROWS):
+        stretch = (stretch ^ row[k : k + count]) * MIX
+        stretch ^= stretch >> np.uint64(29)
+    return stretch, changed[COPIED_ROWS - 1 :] - changed[:count] >= COPIED_CHANGES
+
+
+def _copied_rows(recording: Recording) -> list[QualityWarning]:
+    """Rows that equal earlier ones bit for bit, as where runs were appended twice."""
+    stretch, counts = _stretch_hashes(recording)
+    _, first, which = np.unique(stretch, return_index=True, return_inverse=True)
+    copied = np.flatnonzero(counts & (first[which] < np.arange(len(stretch))))
+    if not len(copied):
+        return []
+    edges = np.zeros(recording.samples + 1, np.int64)
+    np.add.at(edges, copied, 1)
+    np.add.at(edges, copied + COPIED_ROWS, -1)
+    rows = int((np.cumsum(edges) > 0).sum())
+    start = int(copied[0])
+    text = (
+        f"{rows} of {recording.samples} rows equal earlier ones bit for bit, from here on those "
+        f"from sample {int(first[which][start]) + 1} on: copies count twice in a fit, and held-out "
+        "rows are known to it; remove them"
+    )
+    return [QualityWarning(start, text)]
+
+
+def copies_of_others(recordings: list[Recording]) -> list[str]:
+    """A line for each recording that has rows of one before it, bit for bit."""
+    found: list[str] = []
+    hashes = [_stretch_hashes(recording) for recording in recordings]
+    known = [np.unique(stretch[counts]) for stretch, counts in hashes]
+    for later in range(1, len(recordings)):
+        for earlier in range(later):
+            both = np.isin(known[later], known[earlier], assume_unique=True)
+            if both.any():
+                found.append(
+                    f"{recordings[later].label}: {both.mean():.0%} of its motion equals that of "
+                    f"{recordings[earlier].label} bit for bit: copies count twice in a fit, and "
+                    "held-out rows are known to it; give each row once"
+                )
+                break
+    return found
 
 
 # --- frozen signals ----------------------------------------------------------------------------

@@ -38,9 +38,10 @@ run = np.array([int(row.get("run") or 0) for row in rows])
 begins = np.diff(run, prepend=run[0] - 1) != 0  # each run starts anew, at its own first row
 warm = np.array([float(row.get("temp_C") or "nan") for row in rows])
 steps = np.where(begins, 0.0, np.diff(time, prepend=time[0]))
-for now, dt, temperature, begin in zip(pressure, steps, warm, begins, strict=True):
+for now, dt, temperature, begin, since in zip(pressure, steps, warm, begins, time, strict=True):
     if begin:
-        (state,) = start(now[None])
+        state = np.array(start(now[None])[0])
+        state[:, about["state"]["elapsed"]] = since  # a drift follows the recording's own time
     warmth = [np.array([temperature])] * ("temperature_C" in about["step"]["inputs"])
     state, points = step(state, now[None], np.array([dt]), *warmth)
     print(",".join(f"{value:.9f}" for value in np.asarray(points).ravel()))

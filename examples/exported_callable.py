@@ -31,8 +31,8 @@ run = np.array([int(row.get("run") or 0) for row in rows])
 begins = np.diff(run, prepend=run[0] - 1) != 0  # each run starts anew, at its own first row
 steps = np.where(begins, 0.0, np.diff(time, prepend=time[0]))
 
-for now, dt, temperature, begin in zip(pressure, steps, warm, begins, strict=True):
+for now, dt, temperature, begin, since in zip(pressure, steps, warm, begins, time, strict=True):
     if begin:
-        state = arm.start(now[None])
+        state = arm.start(now[None], elapsed_s=since)  # for a drift: the recording's own time
     state, points = arm.step(state, now[None], dt, temperature)
     print(",".join(f"{value:.9f}" for value in points.ravel()))

@@ -86,6 +86,11 @@ def _model(source: Path, output: Path, data: list[Path] | None) -> list[Path]:
     measured = read_recordings(data) if data else []
     with progress(f"export {source}"):
         files = export_arm(source, output, measured)
+    if read_json(output / "arm.json")["state"]["elapsed"]:
+        print(
+            "the model drifts with the elapsed time, which counts from 'start': where a run begins "
+            "later in its recording, set state.elapsed of arm.json (docs/export.md)"
+        )
     for name, found in differences(output).items():
         print(
             f"{name}: over {found['rows']} rows the files differ from the model by "

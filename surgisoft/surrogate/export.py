@@ -97,6 +97,14 @@ class ArmGraph(nn.Module):
             self.warm = self._depends_on_temperature()
 
     @property
+    def elapsed(self) -> list[int]:
+        """Indices of the numbers of the state that are the time since the recording began, s."""
+        effects = self.model.effects
+        keeps = {f"memory.{name}" for name in effects if effects[name].keeps_time}
+        parts = (part for part in self.parts if part.name in keeps)
+        return [number for part in parts for number in range(part.first, part.last)]
+
+    @property
     def inputs(self) -> list[str]:
         """Names of the arguments of `step`."""
         return ["state", "pressure", "dt_s", *["temperature_C"] * self.warm]
@@ -276,7 +284,9 @@ def describe_arm(graph: ArmGraph, worst_mm: float) -> dict[str, Any]:
         ],
         "tensors": tensors,
         "rest": {"pressure": list(spec.rest), "state": graph.rest_state[0].tolist()},
-        "state": {"size": size, "parts": parts},
+        "state": {"size": size, "parts": parts, "elapsed": graph.elapsed},
+        "elapsed_meaning": "numbers of the state that are the time since the recording began, s: "
+        "set them where a run begins later",
         "largest_difference_mm": worst_mm,
     }
 
@@ -353,7 +363,9 @@ def _write_code(
                 expected = graph.model.predict(run)[0].numpy()
             stood = run.stood
             first = None if stood is None or bool(stood.isnan().any()) else stood[0].numpy()
-            gap = float(np.abs(played(arm, network.name, first, run_of(run)) - expected).max())
+            began_s = float(run.t_s[0, 0])
+            found = played(arm, network.name, first, run_of(run), began_s)
+            gap = float(np.abs(found - expected).max())
             if not gap <= TOLERANCE_MM:
                 later = "; key points of a run may not depend on its later rows" * network.runs_only
                 raise DoesNotTrace(
@@ -390,6 +402,8 @@ def _played(graph: ArmGraph, history: History, start: Call, step: Call) -> Tenso
         state = graph.rest_state
     else:
         (state,) = start(stood)
+    state = torch.as_tensor(state).clone()
+    state[:, graph.elapsed] = history.t_s[:, :1].double()
     dt_s, points = history.dt_s.double(), []
     warm = history.temperature_C
     for row in range(history.pressure.shape[1]):

@@ -157,9 +157,9 @@ def test_the_file_predicts_a_recording_as_the_model_does(name, effects, bench): 
 
 
 def test_the_example_begins_every_run_anew(two_runs):  # noqa: F811
-    model, history = wrapped("stepped", ("hysteresis", "creep")), exact(two_runs[1])
-    export_arm(model, "arm")
-    expected = history.rows(model.double().predict(history)).numpy()
+    model, history = wrapped("stepped", ("hysteresis", "drift")), exact(two_runs[1])
+    export_arm(model, "arm", {"two_runs": history})
+    expected = history.rows(model.double().predict(history)).detach().numpy()
     np.testing.assert_allclose(predicted(two_runs[0], "arm"), expected, atol=1e-5)
 
 

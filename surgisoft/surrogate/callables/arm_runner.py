@@ -9,7 +9,10 @@ own module, and nothing else of surgisoft; the effects before and behind the cal
     state = arm.start(pressure)                        # (B, m) -> (B, S)
     state, points = arm.step(state, pressure, dt_s)    # -> (B, S), (B, n, 3) mm
 
-`arm.json` states units, ranges and the parts of the state. The first row of a run has dt_s = 0.
+`arm.json` states units, ranges and the parts of the state. The first row of a run has dt_s = 0. A
+drift with the elapsed time counts from the start of the run, or goes on from `elapsed_s`:
+
+    state = arm.start(pressure, elapsed_s=600.0)       # the recording began ten minutes before
 """
 
 from __future__ import annotations
@@ -42,13 +45,19 @@ class Arm:
         self.called = Called(ABOUT["model_code"], model)
         self.chambers, self.keep_rows = ABOUT["model_code"]["chambers"], keep_rows
         self.size, self.warm = ABOUT["state"]["size"], "temperature_C" in ABOUT["tensors"]
+        self.elapsed = ABOUT["state"].get("elapsed", [])
 
-    def start(self, pressure):
-        """State (B, S) of arms before a run that begins at pressure (B, m)."""
+    def start(self, pressure, elapsed_s=0.0):
+        """State (B, S) of arms before a run that begins at pressure (B, m).
+
+        elapsed_s: time since the recording began, s, which a drift follows; one number, or (B,).
+        """
         pressure = self._rows(pressure, "pressure")
         with np.errstate(all="ignore"):
             each = [STEPS["start"]([self.called], row[None])[0] for row in pressure]
-        return np.concatenate(each)
+        state = np.concatenate(each)
+        state[:, self.elapsed] = np.asarray(elapsed_s, np.float64).reshape(-1, 1)
+        return state
 
     def step(self, state, pressure, dt_s, temperature_C=np.nan):
         """State (B, S) and key points (B, n, 3) mm after pressure (B, m) was held for dt_s.

@@ -98,14 +98,25 @@ def opened(file: Path) -> dict[str, Any]:
     return space
 
 
-def played(arm: Any, name: str, first: np.ndarray | None, rows: Sequence[np.ndarray]) -> np.ndarray:
+def played(
+    arm: Any,
+    name: str,
+    first: np.ndarray | None,
+    rows: Sequence[np.ndarray],
+    began_s: float = 0.0,
+) -> np.ndarray:
     """(T, n, 3) mm: one run stepped through the file's functions.
 
     name: of the callable; first: (m,) actuation at which the run begins, None: at rest; rows:
-    actuation (T, m), dt_s (T,), and temperatures (T,).
+    actuation (T, m), dt_s (T,), and temperatures (T,); began_s: time since the recording began at
+    the first row, s.
     """
     try:
-        state = np.array(arm_rest(arm))[None] if first is None else arm.start(first[None])
+        if first is None:
+            state = np.array(arm_rest(arm))[None]
+            state[:, arm.elapsed] = began_s
+        else:
+            state = arm.start(first[None], began_s)
         points = []
         for actuation, dt_s, warm in zip(*rows, strict=True):
             state, found = arm.step(state, actuation[None], dt_s, warm)

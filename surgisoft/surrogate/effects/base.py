@@ -148,6 +148,11 @@ class Effect(nn.Module, ABC):
         """Actuation (..., m) as a load: 0 at rest, 1 at the end of the range farther from rest."""
         return (signal - self.origin) / self.reach
 
+    @property
+    def keeps_time(self) -> bool:
+        """Whether the memory is the time since the recording began, s, where it is stated."""
+        return False
+
     @abstractmethod
     def rest(self, signal: Tensor) -> Tensor:
         """Memory (B, ...) of an arm at rest at the signal (B, ...)."""

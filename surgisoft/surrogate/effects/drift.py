@@ -101,6 +101,11 @@ class Drift(Effect):
             return {"turn": self.turn, "shift": self.shift}
         return {"gain": self.gain, "offset": self.offset}
 
+    @property
+    def keeps_time(self) -> bool:
+        """Whether the memory is the elapsed time, and not a warming."""
+        return self.kind != "temperature"
+
     def rest(self, signal: Tensor) -> Tensor:
         """(B, 1) elapsed time, s, or warming over T_0, K: none."""
         return signal.new_zeros(len(signal), 1)

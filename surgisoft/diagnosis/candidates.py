@@ -189,7 +189,7 @@ def sensitivities_of(problem: RowsOfModel, signal: Signals, effect: Effect) -> n
     """
     chain, at = problem.model.chain, signal.taps.behind[effect.stage]
     before = chain.first_memory(effect, signal.rest, at[:, 0], signal.first)
-    memory = memory_at(effect, before, at, signal.context, problem.rows)
+    memory = memory_at(effect, before, at, signal.context, problem.rows, problem.history)
     changes = chain.sensitivities(effect, problem.rows(at), memory, signal.slope)
     return changes.movedim(0, -1).numpy()
 

@@ -8,6 +8,7 @@ First-order sensitivities use the signals that a scan has recorded.
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -205,7 +206,9 @@ class Scanning:
         runs that are scanned, which networks of whole runs need; keeps: whether memories are kept
         where there are very many rows and all are asked for.
         """
-        self.history, self.keeps = history, keeps
+        self.history, self.keeps, self.groups = history, keeps, None
+        if history is not None and _mostly_padding(history):
+            self.groups = history.groups
         self.start, self.context, self.rows, self.given = start, context, rows, direction
         self.memory: dict[str, Tensor] = {}
 
@@ -220,7 +223,9 @@ class Scanning:
         """(R, T, m) direction of change; every run starts from rest."""
         if self.given is not None:
             return self.given
-        return direction_scan(chamber, chain.band, chain.rest)[1]
+        return self._by_length(
+            lambda along: direction_scan(along, chain.band, chain.rest)[1], chamber
+        )
 
     def effect(self, link: Link, signal: Signal) -> Tensor:
         """Signal behind an effect whose memory has followed every row; see `keeps`."""
@@ -228,10 +233,17 @@ class Scanning:
         if self.rows is not None and link.stage in ("body", "sensor"):
             return part.apply(value, value[..., :0, 0])
         start, context = self.start[link.name], self.context_at(signal)
-        if (self.rows is not None or not self.keeps) and _very_many(value):
-            answer = torch.empty_like(value)
-            for place, memory in _followed(part, start, value, context):
+        keeps = self.rows is None and self.keeps
+        if _very_many(value) and (not keeps or self.groups is not None):
+            answer, whole = torch.zeros_like(value), None
+            for place, memory in _followed(part, start, value, context, self.groups):
                 answer[place] = part.apply(value[place], memory)
+                if keeps:
+                    if whole is None:
+                        whole = memory.new_zeros(*value.shape[:2], *memory.shape[2:])
+                    whole[place] = memory
+            if whole is not None:
+                self.memory[link.name] = whole
             return answer
         self.memory[link.name] = memory_along(part, start, value, context)
         return part.apply(value, self.memory[link.name])
@@ -247,10 +259,37 @@ class Scanning:
         if network.remembers:
             return network(actuation, direction, network.scan(actuation, direction))
         if self.rows is None and _very_many(actuation):
-            flat = (t.flatten(0, 1).split(BLOCK_ROWS) for t in (actuation, direction))
-            points = torch.cat([network(*some) for some in zip(*flat, strict=True)])
-            return points.view(*actuation.shape[:2], *points.shape[1:])
+            return self._by_length(partial(_in_blocks, network), actuation, direction)
         return network(actuation, direction)
+
+    def _by_length(self, along: Callable[..., Tensor], *signals: Tensor) -> Tensor:
+        """(R, T, ...) result of a function of signals (R, T, ...), group of runs by group.
+
+        Where most rows are padding and there are no gradients: the padding behind a group is 0.
+        """
+        if self.groups is None or not _very_many(signals[0]):
+            return along(*signals)
+        answer = None
+        for runs, steps in self.groups:
+            found = along(*(signal[runs, :steps] for signal in signals))
+            if answer is None:
+                answer = found.new_zeros(*signals[0].shape[:2], *found.shape[2:])
+            answer[runs, :steps] = found
+        assert answer is not None, "a history has a run"
+        return answer
+
+
+def _mostly_padding(history: History) -> bool:
+    """Whether groups of runs of similar length have less than half of the rows of a history."""
+    rows = history.valid.numel()
+    return rows > BLOCK_ROWS and 2 * sum(len(run) * long for run, long in history.groups) < rows
+
+
+def _in_blocks(network: Any, actuation: Tensor, direction: Tensor) -> Tensor:
+    """(R, T, n, 3) key points of a static network, BLOCK_ROWS rows at once."""
+    flat = (t.flatten(0, 1).split(BLOCK_ROWS) for t in (actuation, direction))
+    points = torch.cat([network(*some) for some in zip(*flat, strict=True)])
+    return points.view(*actuation.shape[:2], *points.shape[1:])
 
 
 def _very_many(signal: Tensor) -> bool:
@@ -258,27 +297,40 @@ def _very_many(signal: Tensor) -> bool:
     return not torch.is_grad_enabled() and signal.shape[0] * signal.shape[1] > BLOCK_ROWS
 
 
+Place = tuple[slice | Tensor, slice]
+"""Runs, as a slice or indices (k,), and steps of a block of rows."""
+
+
 def _followed(
-    effect: Effect, start: Tensor, signal: Tensor, context: Context
-) -> Iterator[tuple[tuple[slice, slice], Tensor]]:
+    effect: Effect,
+    start: Tensor,
+    signal: Tensor,
+    context: Context,
+    groups: list[tuple[Tensor, int]] | None = None,
+) -> Iterator[tuple[Place, Tensor]]:
     """The memory of an effect along a signal (R, T, ...) from (R, ...), block of rows by block.
 
     Yields the runs and steps of each block, and its memory. A block follows some whole runs, or a
-    part of one from the memory that the part before it ends with: that is all of its state.
+    part of one from the memory that the part before it ends with: that is all of its state. groups:
+    runs of similar length (`History.groups`), behind whose longest one nothing is followed.
     """
-    runs, steps = signal.shape[:2]
-    wide, long = max(1, BLOCK_ROWS // steps), min(steps, BLOCK_ROWS)
-    for run in range(0, runs, wide):
-        own = slice(run, min(run + wide, runs))
-        memory = start[own]
-        for step in range(0, steps, long):
-            place = own, slice(step, min(step + long, steps))
-            followed = effect.scan(memory, signal[place], _at(context, place))
-            yield place, followed
-            memory = followed[:, -1]
+    runs, most = signal.shape[:2]
+    every: list[tuple[Tensor | None, int]] = [*groups] if groups else [(None, most)]
+    for group, steps in every:
+        count = runs if group is None else len(group)
+        wide, long = max(1, BLOCK_ROWS // steps), min(steps, BLOCK_ROWS)
+        for run in range(0, count, wide):
+            part = slice(run, min(run + wide, count))
+            own = part if group is None else group[part]
+            memory = start[own]
+            for step in range(0, steps, long):
+                place = own, slice(step, min(step + long, steps))
+                followed = effect.scan(memory, signal[place], _at(context, place))
+                yield place, followed
+                memory = followed[:, -1]
 
 
-def _at(context: Context, place: tuple[slice, slice]) -> Context:
+def _at(context: Context, place: Place) -> Context:
     """The context (R, T) of some steps of some runs."""
 
     def part(tensor: Tensor | None) -> Tensor | None:
@@ -311,22 +363,25 @@ def memory_at(
     signal: Tensor,
     context: Context,
     rows: Callable[[Tensor], Tensor],
+    history: History | None = None,
 ) -> Tensor:
     """(S, ...) memory of an effect on some rows of a signal (R, T, ...), from (R, ...) before it.
 
     rows: picks the rows (S, ...) of a (R, T, ...) tensor. Memory follows every row, of which no
-    more than BLOCK_ROWS are held at once.
+    more than BLOCK_ROWS are held at once; history: the runs, whose padding is left out.
     """
     if not _very_many(signal):
         return rows(effect.scan(start, signal, context))
     runs, steps = signal.shape[:2]
     asked = rows(torch.arange(runs * steps).view(runs, steps))
     run, step = asked // steps, asked % steps
-    answer = None
-    for (own, part), memory in _followed(effect, start, signal, context):
-        inside = (run >= own.start) & (run < own.stop)
-        inside &= (step >= part.start) & (step < part.stop)
-        found = memory[run[inside] - own.start, step[inside] - part.start]
+    groups = history.groups if history is not None and _mostly_padding(history) else None
+    every, answer = torch.arange(runs), None
+    for (own, part), memory in _followed(effect, start, signal, context, groups):
+        place = torch.full((runs,), -1)
+        place[own] = every[: len(every[own])]
+        inside = (place[run] >= 0) & (step >= part.start) & (step < part.stop)
+        found = memory[place[run[inside]], step[inside] - part.start]
         if answer is None:
             answer = found.new_empty(len(asked), *found.shape[1:])
         answer[inside] = found

@@ -1,11 +1,15 @@
 """Histories: actuation and key points over time, as tensors to fit and validate models."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
+
+ALIKE = 0.5
+"""Least length of a run, as a share of the longest one of its group."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,31 @@ class History:
         dt = torch.zeros_like(self.t_s)
         dt[:, 1:] = self.t_s[:, 1:] - self.t_s[:, :-1]
         return torch.where(self.valid, dt, torch.zeros_like(dt)).float()
+
+    @cached_property
+    def seen(self) -> Tensor:
+        """(R, T) bool: at least one key point was measured in the row, padding included."""
+        return (~self.key_points.isnan()).all(-1).any(-1)
+
+    @cached_property
+    def groups(self) -> list[tuple[Tensor, int]]:
+        """Indices (k,) of runs of similar length, and the number of rows of the longest of them.
+
+        All runs, longest first. Without the padding behind the longest run of its group, a history
+        has at most 1 / ALIKE times as many rows as were measured.
+        """
+        count = self.valid.shape[1]
+        ends = (self.valid * torch.arange(1, count + 1, device=self.valid.device)).amax(1)
+        order = ends.argsort(descending=True, stable=True)
+        found: list[tuple[Tensor, int]] = []
+        lengths, first = ends[order].tolist(), 0
+        while first < len(lengths):
+            longest = max(lengths[first], 1)
+            last = first + sum(1 for length in lengths[first:] if length >= ALIKE * longest)
+            last = max(last, first + 1)
+            found.append((order[first:last], longest))
+            first = last
+        return found
 
     def rows(self, tensor: Tensor) -> Tensor:
         """The rows of a (R, T, ...) tensor that are no padding, (S, ...), run by run."""

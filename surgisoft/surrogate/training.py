@@ -97,7 +97,7 @@ def dealt(history: History) -> Tensor:
 
 def _seen(history: History) -> Tensor:
     """(R, T) rows, padding included, in which at least one key point was measured."""
-    return (~history.key_points.isnan()).all(-1).any(-1)
+    return history.seen
 
 
 def measured_rows(history: History) -> Tensor:

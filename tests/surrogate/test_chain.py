@@ -287,6 +287,60 @@ def test_long_recordings_are_followed_in_blocks_with_the_same_result(
             assert torch.allclose(values, other[name], rtol=1e-5, atol=2e-4), name
 
 
+@SETS
+def test_one_long_run_beside_short_ones_is_followed_as_each_alone(names, away, monkeypatch):
+    """Runs are followed in groups of similar length, without the padding behind a group."""
+    arm = model(names)
+    lengths = torch.tensor([4, 40, 1, 5, 9, 17, 3, 2])
+    which = torch.arange(len(lengths)) % away.runs
+    mixed = away.select(which)
+    last = (lengths - 1)[:, None, None]
+    rows = torch.arange(40).expand(len(lengths), 40)
+    valid = rows < lengths[:, None]
+    pressure = mixed.pressure.where(
+        valid[..., None], mixed.pressure.gather(1, last.expand(-1, 1, mixed.chambers))
+    )
+    points = mixed.key_points.where(valid[..., None, None], torch.nan)
+    mixed = replace(mixed, valid=valid, pressure=pressure, key_points=points)
+    assert [(sorted(lengths[runs].tolist()), steps) for runs, steps in mixed.groups] == [
+        ([40], 40), ([9, 17], 17), ([3, 4, 5], 5), ([1, 2], 2),
+    ]  # fmt: skip
+    first = arm.first_pressure(mixed)
+    monkeypatch.setattr(chain, "BLOCK_ROWS", 50)
+    with torch.no_grad():
+        taps = arm.chain.scan(mixed, first)
+        bare = arm.chain.scan(mixed, first, memories=False)
+        again = RepeatedScan(arm.chain, mixed, first, set(names), mixed.rows)()
+        inputs = arm.chain.inputs(mixed, first)
+        context = replace(context_of(mixed), pressure=taps.pressure)
+        there = {
+            n: memory_at(e, taps.memory[n][:, 0], taps.behind[e.stage], context, mixed.rows, mixed)
+            for n, e in arm.effects.items()
+        }
+        plain = {
+            n: memory_at(e, taps.memory[n][:, 0], taps.behind[e.stage], context, mixed.rows)
+            for n, e in arm.effects.items()
+        }
+        monkeypatch.setattr(chain, "BLOCK_ROWS", 10**6)
+        for run, length in enumerate(lengths.tolist()):
+            own = mixed.select(torch.tensor([run]))
+            alone = arm.chain.scan(own, first[run : run + 1])
+            pairs = {
+                "points": (taps.behind["sensor"], alone.behind["sensor"]),
+                "bare": (bare.behind["sensor"], alone.behind["sensor"]),
+                "actuation": (inputs[0], alone.behind["material"]),
+                "direction": (inputs[1], alone.direction),
+                **{n: (taps.memory[n], alone.memory[n]) for n in names},
+            }
+            for name, (together, expected) in pairs.items():
+                torch.testing.assert_close(
+                    together[run, :length], expected[0], rtol=1e-5, atol=2e-4, msg=name
+                )
+    torch.testing.assert_close(again, mixed.rows(taps.behind["sensor"]), rtol=1e-5, atol=2e-4)
+    for name in names:
+        torch.testing.assert_close(there[name], plain[name], rtol=1e-5, atol=2e-4)
+
+
 def _tensors(seen) -> dict:
     """The fields of a history that hold tensors."""
     return {k: v for k, v in vars(seen).items() if isinstance(v, torch.Tensor)}

@@ -6,6 +6,7 @@ are closed, bodies are turned outwards, and bodies inside other bodies are remov
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -13,8 +14,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from surgisoft.errors import InputError
-from surgisoft.scene.inside import winding_numbers
+from surgisoft.scene.inside import enclosed
 from surgisoft.scene.mesh import Mesh, equal_rows, used_indices
+from surgisoft.scene.rays import EmbreeSurface
 
 JOIN = (1e-7, 1e-6, 1e-5, 1e-4, 5e-4)
 """Distances, relative to the size, at which vertices are joined; tried until the surface closes."""
@@ -58,6 +60,11 @@ class _Shell:
     """Wound outwards, mm."""
     hole_mm: np.ndarray
     """(F,) mm: width of the hole that a face closes, 0 for a face of the file."""
+
+    @cached_property
+    def surface(self) -> EmbreeSurface:
+        """The mesh for rays."""
+        return EmbreeSurface(self.mesh)
 
 
 def repair(
@@ -387,10 +394,11 @@ def _outward(vertices, faces, hole_mm, log) -> list[_Shell]:
     return shells
 
 
-def _encloses(outer: Mesh, inner: Mesh) -> np.ndarray:
+def _encloses(outer: _Shell, inner: _Shell) -> np.ndarray:
     """Whether each of up to 64 spread vertices of `inner` lies within `outer`: bools."""
-    points = inner.vertices_mm[:: max(1, len(inner.vertices_mm) // 64)]
-    return np.abs(winding_numbers(outer, points)) > 0.5
+    vertices = inner.mesh.vertices_mm
+    points = vertices[:: max(1, len(vertices) // 64)]
+    return enclosed(outer.mesh, points, lambda: outer.surface)
 
 
 def _boxes_meet(a: Mesh, b: Mesh) -> bool:
@@ -404,30 +412,25 @@ def _drop_inner(shells: list[_Shell], log) -> list[_Shell]:
     shells = sorted(shells, key=lambda shell: -shell.mesh.volume_mm3)
     kept: list[_Shell] = []
     for shell in shells:
-        if not any(_lies_inside(shell.mesh, outer.mesh) for outer in kept):
+        if not any(_lies_inside(shell, outer) for outer in kept):
             kept.append(shell)
     log["inner bodies removed"] = len(shells) - len(kept)
     return kept
 
 
-def _lies_inside(inner: Mesh, outer: Mesh) -> bool:
+def _lies_inside(inner: _Shell, outer: _Shell) -> bool:
     """Whether all of `inner` lies within `outer`."""
-    return _boxes_meet(outer, inner) and bool(_encloses(outer, inner).all())
+    return _boxes_meet(outer.mesh, inner.mesh) and bool(_encloses(outer, inner).all())
 
 
-def _overlap(a: Mesh, b: Mesh) -> bool:
+def _overlap(a: _Shell, b: _Shell) -> bool:
     """Whether part of one mesh lies within the other."""
-    return _boxes_meet(a, b) and bool(_encloses(a, b).any() or _encloses(b, a).any())
+    return _boxes_meet(a.mesh, b.mesh) and bool(_encloses(a, b).any() or _encloses(b, a).any())
 
 
 def _merge_touching(shells: list[_Shell]) -> list[_Shell]:
     """Shells that overlap become one body of several shells."""
-    pairs = [
-        (i, j)
-        for i in range(len(shells))
-        for j in range(i)
-        if _overlap(shells[i].mesh, shells[j].mesh)
-    ]
+    pairs = [(i, j) for i in range(len(shells)) for j in range(i) if _overlap(shells[i], shells[j])]
     rows, columns = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
     graph = coo_matrix((np.ones(len(pairs)), (rows, columns)), shape=(len(shells),) * 2)
     _, label = connected_components(graph, directed=False)

@@ -7,7 +7,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from surgisoft.scene import frames
+from surgisoft.scene import frames, inside
 from surgisoft.scene.ablation import AblationMap
 from surgisoft.scene.author import CROSSING, Request, prepare
 from surgisoft.scene.collision import CollisionChecker
@@ -15,6 +15,7 @@ from surgisoft.scene.dose_patch import cut_patch
 from surgisoft.scene.inside import buried, buried_faces, winding_numbers
 from surgisoft.scene.mesh import Body, Mesh
 from surgisoft.scene.meshio import write_ply
+from surgisoft.scene.rays import EmbreeSurface
 from tests.scene.shapes import lumpy
 
 AXES = np.array([40.0, 30.0, 30.0])
@@ -29,6 +30,29 @@ def crossing(subdivisions=5) -> Mesh:
         np.concatenate((corners - AWAY, corners + AWAY)),
         np.concatenate((one.faces, one.faces + len(corners))),
     )
+
+
+def test_points_of_many_are_enclosed_by_rays(monkeypatch):
+    """As the ellipsoids say; solid angles are summed for points on the surface alone."""
+    mesh, summed = crossing(5), []
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-1.2, 1.2, (400, 3)) * (AXES + AWAY)
+    sizes = np.stack([frames.norm((points - side * AWAY) / AXES) for side in (1.0, -1.0)])
+    points = points[(abs(sizes - 1.0) > 0.01).all(axis=0)]
+    expected = (sizes.min(axis=0) < 1.0)[(abs(sizes - 1.0) > 0.01).all(axis=0)]
+    assert 0.2 < expected.mean() < 0.8
+    monkeypatch.setattr(
+        inside, "winding_numbers", lambda *given: summed.extend(given[1]) or winding_numbers(*given)
+    )
+    surface = EmbreeSurface(mesh)
+    np.testing.assert_array_equal(inside.enclosed(mesh, points, lambda: surface), expected)
+    assert len(summed) < 0.02 * len(points)
+    on = mesh.vertices_mm[::500]
+    inside.enclosed(mesh, on, lambda: surface)
+    buried_in_other = frames.norm((on + np.where(on[:, :1] > 0, 1.0, -1.0) * AWAY) / AXES) < 0.99
+    assert len(summed) >= (~buried_in_other).sum() - 2
+    few = points[:10]
+    np.testing.assert_array_equal(inside.enclosed(mesh, few, lambda: surface), expected[:10])
 
 
 def test_the_sheets_inside_the_other_ellipsoid_are_buried():

@@ -344,7 +344,7 @@ def test_the_fall_is_that_of_the_rms_distance():
     before = SimpleNamespace(
         residual=residual,
         block=block,
-        floor_mm=0.1,
+        told_floor_mm=0.1,
         index=np.arange(60),
         in_fit=None,
     )

@@ -270,16 +270,18 @@ def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
 def _further(facts: ArmFacts, points: Tensor) -> list[Effect]:
     """Lines along single chambers, or of a plane section: loops add up (Kuhnen 2003).
 
-    Where the chambers are no ring of three or four, such as those of two sections, one alone may
-    have loops.
+    Where there are not three chambers in a ring, one alone may have loops: a tendon of four, a
+    chamber of two sections.
     """
     m = len(facts.low)
-    if m in RINGS:
-        section = Hysteresis(facts, FEW_RADII, True, True, SECTION[m], True)
-        return [*(Hysteresis(facts, FEW_RADII, True, False, o) for o in OTHERS[::2]), section]
     if m == 1:
         return [Hysteresis(facts, FEW_RADII, True, False)]
-    alike = [Hysteresis(facts, FEW_RADII, True, False, others) for others in OTHERS]
+    shares = OTHERS[::2] if m in RINGS else OTHERS
+    alike = [Hysteresis(facts, FEW_RADII, True, False, others) for others in shares]
+    if m in RINGS:
+        alike.append(Hysteresis(facts, FEW_RADII, True, True, SECTION[m], True))
+    if m == 3:
+        return alike
     return [*alike, *(Hysteresis(facts, FEW_RADII, chamber=chamber) for chamber in range(m))]
 
 

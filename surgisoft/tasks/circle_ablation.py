@@ -64,8 +64,11 @@ class CircleAblation(RingTask[RingCut]):
         return draw_cut(stream)
 
     def alone(self, state: TaskState[RingCut]) -> LoneRing | None:
-        """The episode of a state of one environment, advanced without tensors; see `LoneRing`."""
-        return LoneRing.of(self, state)
+        """The episode of a state of one environment, advanced without tensors; see `LoneRing`.
+
+        None for a class that extends this one: `LoneRing` has the rules of this one alone.
+        """
+        return LoneRing.of(self, state) if type(self) is CircleAblation else None
 
 
 CIRCLE_ABLATION = TaskSpec(

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from surgisoft.compiled import compiled
-from surgisoft.tasks.base import TaskState
+from surgisoft.tasks.base import TaskState, term_names
 from surgisoft.tasks.laser_work import ENDOSCOPE, LASER, RingTask
 from surgisoft.tasks.observations import OBSERVATION_LIMIT
 from surgisoft.tasks.trajectories.closed_path import RingCut
@@ -93,7 +93,12 @@ class LoneRing:
 
     @classmethod
     def of(cls, task: RingTask[RingCut], state: TaskState) -> LoneRing | None:
-        """The episode of a state of one environment; None where only the task can advance it."""
+        """The episode of a state of one environment; None where only the task can advance it.
+
+        `task` is a `CircleAblation` and of no class that extends it.
+        """
+        if any(not set(term_names(weights)) <= set(TERMS) for weights in task.weights.values()):
+            return None
         world = LoneWorld.of(task.world, state.world)
         return None if world is None else cls(task, state, world)
 

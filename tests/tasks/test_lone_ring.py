@@ -1,13 +1,15 @@
 """An episode in kept arrays against the same episode as a batch of one, over whole episodes."""
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
 import torch
 
 from surgisoft.tasks.base import Episodes, TaskState
+from surgisoft.tasks.batched import BatchedEnv
 from surgisoft.tasks.circle_ablation import CircleAblation, CircleAblationConfig
+from surgisoft.tasks.laser_work import LASER, LaserWeights, LaserWorkWeights
 from surgisoft.tasks.lone_ring import LoneRing
 from surgisoft.tasks.parallel import SurgicalEnv, parallel_env
 from surgisoft.tasks.world.arm import Randomisation
@@ -58,9 +60,9 @@ def differences(env, plain, seed, steps, at_work):
                 break
         lone, batch = env.task_state, plain.task_state
     for name, part in batch.world.arms.items():
-        for field in ("points_mm", "line_mm", "pressure", "command"):
-            off = (getattr(lone.world.arms[name], field) - getattr(part, field)).abs().max()
-            worst[field] = max(worst.get(field, 0.0), float(off))
+        for what in ("points_mm", "line_mm", "pressure", "command"):
+            off = (getattr(lone.world.arms[name], what) - getattr(part, what)).abs().max()
+            worst[what] = max(worst.get(what, 0.0), float(off))
     scene, other = lone.world.scene, batch.world.scene
     assert torch.equal(scene.hit.struck, other.hit.struck)
     worst["beam"] = float((scene.hit.point_mm - other.hit.point_mm).abs().max())
@@ -170,3 +172,77 @@ def test_an_arm_that_is_not_finite_fails_the_environment():
     for agent, seen in expected[0].items():
         assert np.array_equal(found[0][agent], seen)
         assert found[4][agent].keys() == expected[4][agent].keys()
+
+
+@dataclass(frozen=True)
+class GentleWeights(LaserWeights):
+    """Weights with a term of the user's own."""
+
+    gentle: float = -0.01
+    """Sum of the squared pressures of the laser's arm, kPa^2."""
+
+
+@dataclass(frozen=True)
+class GentleWorkWeights(LaserWorkWeights):
+    """Weights of both agents."""
+
+    laser: GentleWeights = field(default_factory=GentleWeights)
+    """Weights of the laser's reward terms."""
+
+
+class GentleAblation(CircleAblation):
+    """A reward, an end, an observation and a measure of the user's own."""
+
+    name = "gentle_ablation"
+
+    def own_terms(self, state):
+        return {LASER: {"gentle": state.world.arms[LASER].pressure.square().sum(1)}}
+
+    def ended(self, state):
+        return state.world.steps >= 3
+
+    def observe(self, state):
+        return {agent: 0.5 * seen for agent, seen in super().observe(state).items()}
+
+    def measures(self, state):
+        return {**super().measures(state), "steps": state.world.steps.float()}
+
+
+def test_a_task_that_extends_the_class_keeps_its_own_methods():
+    """Terms, ends, observations and measures of the adapter are the class's, as in a batch."""
+    config = CircleAblationConfig(weights=GentleWorkWeights())
+    env, batch = SurgicalEnv(GentleAblation(config)), BatchedEnv(GentleAblation(config), 1, seed=4)
+    env.reset(seed=4)
+    push = {agent: np.full(3, 2.0, np.float32) for agent in env.agents}
+    for step in (1, 2, 3):
+        seen, rewards, ends, _, infos = env.step(push)
+        expected = batch.step({agent: kPa[None] for agent, kPa in push.items()})
+        pressure = env.task_state.world.arms[LASER].pressure.double()
+        by_hand = -0.01 * float(pressure.square().sum())
+        assert infos[LASER]["gentle"] == pytest.approx(by_hand, rel=1e-5)
+        assert infos[LASER]["steps"] == step
+        assert ends == dict.fromkeys(push, step == 3)
+        for agent, terms in expected.terms.items():
+            found = {name: infos[agent][name] for name in terms}
+            assert found == pytest.approx({name: float(v) for name, v in terms.items()}, rel=1e-4)
+            assert rewards[agent] == pytest.approx(float(expected.rewards[agent]), rel=1e-4)
+            wanted = expected.final_observations[agent][0].numpy()
+            np.testing.assert_allclose(seen[agent], wanted, atol=AGREE_MM)
+
+
+def test_a_class_that_changes_nothing_but_its_reward_is_advanced_by_the_task():
+    """The documented way: `rewards` overridden, weights as they are."""
+
+    class Mine(CircleAblation):
+        name = "mine"
+
+        def rewards(self, state):
+            mine = torch.full((len(state.world.steps),), 100.0)
+            return {a: {**terms, "mine": mine} for a, terms in super().rewards(state).items()}
+
+    env = SurgicalEnv(Mine())
+    env.reset(seed=0)
+    _, rewards, _, _, infos = env.step({agent: np.zeros(3, np.float32) for agent in env.agents})
+    for agent in (LASER, "endoscope"):
+        assert infos[agent]["mine"] == 100.0
+        assert 100.0 < rewards[agent] < 106.0

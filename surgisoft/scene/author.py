@@ -171,6 +171,8 @@ class Prepared:
     """Names of the bodies; the first file's come first, largest first."""
     roles: tuple[str, ...]
     """Role of each."""
+    operable: tuple[int, ...]
+    """Numbers of the bodies on which a lesion may lie: all of a file or label of the role organ."""
     meshes: tuple[Mesh, ...]
     """Closed meshes, world frame, mm."""
     holes_mm: tuple[np.ndarray, ...]
@@ -223,6 +225,7 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
     notes: list[str] = []
     names: list[str] = []
     roles, meshes, holes_mm, frames_to_world = [], [], [], []
+    operable: list[int] = []
     lesion_mm: np.ndarray | None = None
     unit: LengthUnit | None = None
     for i, (path, role) in enumerate(zip(request.meshes, request.roles, strict=True)):
@@ -249,6 +252,8 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
             found = _closed_bodies(path, group, frames_to_world[-1], notes, on_step)
             found = sorted(found, key=lambda body: -_area(body[1]))
             for k, (name, mesh, hole_mm) in enumerate(found):
+                if group_role == "organ":
+                    operable.append(len(names))
                 names.append(_free_name(name, names))
                 roles.append(group_role if k == 0 or group_role != "organ" else "keep-out")
                 meshes.append(mesh)
@@ -266,6 +271,7 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
     return Prepared(
         tuple(names),
         tuple(roles),
+        tuple(operable),
         tuple(meshes),
         tuple(holes_mm),
         frames_to_world[0],
@@ -401,12 +407,10 @@ def choose_sites(request: Request, prepared: Prepared) -> list[Site]:
         OrganSurface(mesh, hole_mm)
         for mesh, hole_mm in zip(prepared.meshes, prepared.holes_mm, strict=True)
     ]
-    operable = [
-        surface for surface, role in zip(surfaces, prepared.roles, strict=True) if role != "support"
-    ]
+    operable = [surfaces[i] for i in prepared.operable]
     diameter_mm = ring_diameter(request, prepared)
-    if request.lesion is not None:
-        point = prepared.to_world @ np.asarray(request.lesion) + prepared.shift_mm
+    point = given_point_mm(request, prepared)
+    if request.lesion is not None and point is not None:
         given = f"--lesion {' '.join(f'{x:g}' for x in request.lesion)}"
         if not np.allclose(point, request.lesion):
             given += f" (in the scene {', '.join(f'{x:.4g}' for x in point)} mm)"
@@ -418,6 +422,13 @@ def choose_sites(request: Request, prepared: Prepared) -> list[Site]:
         point, _, _ = segmented_lesion(prepared)
         return [pointed_site(operable[:1], point, diameter_mm, "the segmented lesion")]
     return good_sites(surfaces, diameter_mm)
+
+
+def given_point_mm(request: Request, prepared: Prepared) -> np.ndarray | None:
+    """(3,) mm: the point that was given for the lesion, world frame; None without one."""
+    if request.lesion is None:
+        return None
+    return prepared.to_world @ np.asarray(request.lesion) + prepared.shift_mm
 
 
 def ring_diameter(request: Request, prepared: Prepared) -> float:
@@ -492,7 +503,7 @@ def author(
             scene = _scene(request, prepared, site, bodies, arranged, mounts, name)
             check = check_scene(scene, reaches)
             if check.good:
-                chosen = _chosen(scene, check, site, prepared)
+                chosen = _chosen(request, scene, check, site, prepared)
                 return Authored(scene, check, (*prepared.notes, *chosen))
             why = sentence(check).removesuffix(".")
             failures.append((check.work.covered if check.work else 0.0, why))
@@ -516,8 +527,7 @@ def _coarse(ring):
 
 def _bodies(prepared: Prepared, site: Site) -> tuple[Body, ...]:
     """The scene's bodies, the one with the lesion as an organ."""
-    operable = [i for i, role in enumerate(prepared.roles) if role != "support"]
-    organ = operable[site.body]
+    organ = prepared.operable[site.body]
     return tuple(
         Body(name, "organ" if i == organ else role, mesh)
         for i, (name, role, mesh) in enumerate(
@@ -527,13 +537,12 @@ def _bodies(prepared: Prepared, site: Site) -> tuple[Body, ...]:
 
 
 def _scene(request, prepared, site: Site, bodies, arranged: Arrangement, mounts, name) -> Scene:
-    operable = [i for i, role in enumerate(prepared.roles) if role != "support"]
     arms = {arm: found.arm for arm, found in arranged.sites.items()}
     spec = SceneSpec(
         name=name,
         bodies=tuple(BodySpec(body.name, f"{body.name}.ply", body.role) for body in bodies),
         lesion=LesionSpec(
-            prepared.names[operable[site.body]],
+            prepared.names[prepared.operable[site.body]],
             tuple(site.point_mm.round(4).tolist()),
             float(request.diameter_mm),
         ),
@@ -566,12 +575,32 @@ def rounded_mount(position_mm: np.ndarray, rotation: np.ndarray) -> dict[str, An
     }
 
 
-def _chosen(scene: Scene, check: SceneCheck, site: Site, prepared: Prepared) -> list[str]:
+def _nearer_body(request: Request, prepared: Prepared, site: Site) -> str:
+    """Which body that is not operated on is nearer to the given point than the lesion; '' none."""
+    point = given_point_mm(request, prepared)
+    away = {
+        name: float(np.linalg.norm(nearest_on_surface(mesh, point[None])[0] - point))
+        for i, (name, mesh) in enumerate(zip(prepared.names, prepared.meshes, strict=True))
+        if point is not None and i not in prepared.operable
+    }
+    name = min(away, key=lambda each: away[each], default="")
+    if not name or away[name] >= site.moved_mm:
+        return ""
+    organ = prepared.names[prepared.operable[site.body]]
+    return (
+        f"the given point is nearer to '{name}' ({away[name]:.3g} mm) than to '{organ}' "
+        f"({site.moved_mm:.3g} mm); a lesion lies on the organ, the body of the first file"
+    )
+
+
+def _chosen(
+    request: Request, scene: Scene, check: SceneCheck, site: Site, prepared: Prepared
+) -> list[str]:
     assert check.work is not None, "a scene that was chosen has its arms at work"
     cuts = check.work.cuts.values()
     centre = ", ".join(f"{x:.1f}" for x in scene.spec.lesion.centre_mm)
     moved = f"the given point was {site.moved_mm:.3g} mm off the surface and was moved onto it"
-    segmented = prepared.lesion_mm is not None
+    segmented, nearer = prepared.lesion_mm is not None, _nearer_body(request, prepared, site)
     if segmented:
         _, radius, depth = segmented_lesion(prepared)
         moved = (
@@ -580,6 +609,7 @@ def _chosen(scene: Scene, check: SceneCheck, site: Site, prepared: Prepared) -> 
         )
     return [
         *([moved] if segmented or site.moved_mm > REPORTED_FROM_MM else []),
+        *([nearer] if nearer else []),
         f"lesion of {scene.spec.lesion.diameter_mm:g} mm on '{scene.spec.lesion.body}' at "
         f"[{centre}] mm",
         *([_beams(list(cuts))] if cuts else []),

@@ -266,7 +266,7 @@ class Site:
 def pointed_site(
     bodies: list[OrganSurface], point_mm: np.ndarray, diameter_mm: float, given: str | None = None
 ) -> Site:
-    """The site at the surface point, of any body, that is nearest to `point_mm` (3,).
+    """The site at the surface point, of any of these bodies, that is nearest to `point_mm` (3,).
 
     An InputError if no surface is near; `given` is the point as the user wrote it.
     """
@@ -278,7 +278,7 @@ def pointed_site(
     if away[body] > most:
         given = given or f"the point {tuple(point_mm.round(3).tolist())} mm"
         raise InputError(
-            f"{given} lies {away[body]:.4g} mm from the nearest surface; expected at most "
+            f"{given} lies {away[body]:.4g} mm from the organ's surface; expected at most "
             f"{most:.4g} mm: give it in the first file's own frame and unit, or check --unit"
         )
     site = _with_ring(bodies, body, points[0], int(faces[0]), diameter_mm)

@@ -175,6 +175,36 @@ def test_the_lesion_of_an_open_tube_lies_on_its_wall(tmp_path):
         assert np.all((radius > 15.0 * np.cos(np.pi / 96) - 1e-6) & (radius < 15.0 + 1e-6))
 
 
+def test_a_point_beside_a_keep_out_body_is_a_lesion_of_the_organ(tmp_path, capsys):
+    """A ball of 60 mm; the point lies 12.2 mm above it and 8.1 mm from a vessel of 8 mm."""
+    write_ply(ball(60.0, 3), tmp_path / "organ.ply")
+    write_ply(moved(ball(8.0, 2), 0.0, 22.0, 74.0), tmp_path / "vessel.ply")
+    files, point = (tmp_path / "organ.ply", tmp_path / "vessel.ply"), (0.0, 6.0, 72.0)
+    assert new(tmp_path / "scene", *files, "--lesion", *point) == 0
+    scene, said = open_scene(tmp_path / "scene"), capsys.readouterr()
+    assert [(b.name, b.role) for b in scene.bodies] == [("organ", "organ"), ("vessel", "keep-out")]
+    assert scene.spec.lesion.body == "organ"
+    on_ball = 60.0 * np.array(point) / np.linalg.norm(point)
+    np.testing.assert_allclose(scene.spec.lesion.centre_mm, on_ball, atol=0.5)
+    text = " ".join((said.out + said.err).split())
+    found = re.search(r"nearer to 'vessel' \((.*?) mm\) than to 'organ' \((.*?) mm\)", text)
+    away = np.linalg.norm(np.array(point) - [0.0, 22.0, 74.0]) - 8.0
+    assert float(found[1]) == pytest.approx(away, abs=0.3)
+    assert float(found[2]) == pytest.approx(np.linalg.norm(point) - 60.0, abs=0.3)
+
+
+def test_a_smaller_body_of_the_organs_file_can_have_the_lesion(tmp_path):
+    """Two balls in one file: the point is on the smaller one, which a lesion may lie on."""
+    both = trimesh.util.concatenate(
+        [trimesh.Trimesh(m.vertices_mm, m.faces) for m in (ball(40.0), moved(ball(30.0), 90, 0, 0))]
+    )
+    both.export(tmp_path / "two.stl")
+    request = Request((tmp_path / "two.stl",), ("organ",), lesion=(90.0, 0.0, 31.0))
+    (site,) = choose_sites(request, prepare(request))
+    assert site.body == 1
+    np.testing.assert_allclose(site.point_mm, [90.0, 0.0, 30.0], atol=0.3)
+
+
 @pytest.mark.parametrize(
     "place", [{"lesion": (0.0, 0.0, 61.0)}, {"lesion_direction": (0.0, 0.0, 1.0)}]
 )
@@ -434,7 +464,10 @@ def test_the_reason_ends_with_one_full_stop(tmp_path, capsys, monkeypatch):
 
 
 BAD = [
-    (("ball.ply", "--lesion", "0", "0", "81"), "--lesion 0 0 81 lies 21 mm from the nearest"),
+    (
+        ("ball.ply", "--lesion", "0", "0", "81"),
+        "--lesion 0 0 81 lies 21 mm from the organ's surface",
+    ),
     (
         ("ball.ply", "--unit", "cm", "--lesion", "0", "0", "81"),
         "in the scene 0, 0, 810 mm) lies 210 mm",

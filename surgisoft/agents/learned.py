@@ -42,8 +42,7 @@ class LearnedPolicy(ActorPolicy):
         if which not in (None, BEST, LAST):
             raise unknown_name("checkpoint", which, (BEST, LAST))
         self.run = RunFolder(folder)
-        if which is None:
-            which = BEST if self.run.checkpoint(BEST).is_file() else LAST
+        which = self.run.chosen if which is None else which
         device = task.world.device if task else "cpu"
         saved, plan = self.run.load(which, device), self.run.plan()
         file, actors = self.run.checkpoint(which), {}

@@ -8,6 +8,7 @@ evaluation. Checkpoints are read as plain tensors and numbers: none runs code.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import io
 import json
 import os
@@ -249,6 +250,17 @@ class RunFolder:
     def checkpoint(self, which: str) -> Path:
         """The file of `last` or `best`."""
         return self.path / "checkpoints" / f"{which}.pt"
+
+    @property
+    def chosen(self) -> str:
+        """Which checkpoint acts where none is named: `best`, or `last` where there is no best."""
+        return BEST if self.checkpoint(BEST).is_file() else LAST
+
+    @property
+    def policy_hash(self) -> str | None:
+        """sha256 in hex of the chosen checkpoint's file; None where there is no such file yet."""
+        file = self.checkpoint(self.chosen)
+        return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None
 
     def save(self, which: str, content: dict[str, Any]) -> None:
         """Write a checkpoint, whole or not at all."""

@@ -22,8 +22,9 @@ from torch import Tensor
 from surgisoft.agents.evaluate import RATES, episode_table
 from surgisoft.agents.exact_checks import EpisodeCheck, ExactChecks, has_obstacles
 from surgisoft.agents.on_rig import at_benches, real_benches, rigs_by_arm
+from surgisoft.agents.policies import POLICIES
 from surgisoft.agents.rollout import EpisodeRecorders, Instant, Rollout, rollout
-from surgisoft.agents.run_folder import versions
+from surgisoft.agents.run_folder import RunFolder, versions
 from surgisoft.config import LARGEST_INTEGER, Where
 from surgisoft.errors import InputError
 from surgisoft.experiments.controllers import PhaseControllers
@@ -38,6 +39,7 @@ from surgisoft.experiments.plan import (
 )
 from surgisoft.experiments.spec import (
     FILE,
+    NOMINAL,
     Case,
     Experiment,
     load_experiment,
@@ -46,12 +48,15 @@ from surgisoft.experiments.spec import (
 from surgisoft.files import json_safe, new_folder, read_json, resolved, write_json
 from surgisoft.progress import Progress, silent
 from surgisoft.rig.registry import SIMULATED, check_rig, parse_rig
+from surgisoft.surrogate.checkpoint import content_hash
 from surgisoft.surrogate.code import name_code, named_code
 from surgisoft.tasks.episodes.file import save_episode
 from surgisoft.tasks.episodes.log import EpisodeLog
 from surgisoft.tasks.supervision import Row
 from surgisoft.workers import CLUSTER, check_processes, torch_threads, workers
 
+POLICY = "policy"
+"""Name of a policy's digest among those of a case; those of arm models have the arms' names."""
 DROPPED = ("phase", "reason", "reason_phase", "beam", "beam_unsafe", "safe")
 """Measures of single steps whose means mean nothing."""
 
@@ -123,7 +128,7 @@ def open_results(
                 f"{', '.join(differ)}); run that file with --resume to continue it, choose another "
                 "folder, or --force to start again"
             )
-        _check_scene(spec, folder)
+        _check_began_with(spec, folder)
         check_playable(spec, folder, progress)
         if not remote:
             check_benches(spec, folder)
@@ -143,6 +148,7 @@ def open_results(
     about: dict[str, object] = {"versions": versions()}
     if spec.in_scene:
         about["scene_hash"] = scene_of(spec, settings(spec)[0]).content_hash
+    about["cases"] = {case.name: _case_hashes(spec, case) for case in spec.cases}
     replaced = [path.name for path in folder.iterdir()] if folder.exists() else []
     with new_folder(folder, own=replaced) as fresh:  # old results stay until the new ones begin
         (fresh / "rows").mkdir()
@@ -150,16 +156,48 @@ def open_results(
         save_experiment(spec, fresh / FILE)
 
 
-def _check_scene(spec: Experiment, folder: Path) -> None:
-    """Raise an InputError where the scene is not the one that the results began with."""
+def _check_began_with(spec: Experiment, folder: Path) -> None:
+    """Raise an InputError where the scene, or the policy or an arm model of a case that goes on, is
+    not the one that the results began with. Results of earlier versions state the scene alone."""
     file = folder / "versions.json"
     about = read_json(file) if file.is_file() else None
-    began = about.get("scene_hash") if isinstance(about, dict) else None
+    about = about if isinstance(about, dict) else {}
+    began = about.get("scene_hash")
     if spec.in_scene and began not in (None, scene_of(spec, settings(spec)[0]).content_hash):
-        raise InputError(
-            f"{folder}: its scene '{spec.scene}' has changed since the results began (by {file}); "
-            "bring that scene back, or --force to start again"
-        )
+        raise _changed(folder, f"its scene '{spec.scene}'", "scene")
+    cases = about.get("cases")
+    stated = cases if isinstance(cases, dict) else {}
+    left = {job.setting.case.name for job in jobs(spec) if not _is_done(folder, job)}
+    for case in spec.cases:
+        before = stated.get(case.name)
+        if case.name not in left or not isinstance(before, dict):
+            continue
+        now = _case_hashes(spec, case)
+        for name in (name for name in before if name in now and now[name] != before[name]):
+            what = f"the policy '{case.policy}'" if name == POLICY else f"the arm model of '{name}'"
+            kind = "policy" if name == POLICY else "model"
+            raise _changed(folder, f"{what} of its case '{case.name}'", kind)
+
+
+def _changed(folder: Path, what: str, kind: str) -> InputError:
+    """What the results of a folder began with is not there any more."""
+    return InputError(
+        f"{folder}: {what} has changed since the results began (by {folder / 'versions.json'}); "
+        f"bring that {kind} back, or --force to start again"
+    )
+
+
+def _case_hashes(spec: Experiment, case: Case) -> dict[str, str]:
+    """Digests of what acts in a case: arm's name -> that of its model, `POLICY` -> that of the
+    checkpoint of a training run."""
+    first = next(setting for setting in settings(spec) if setting.case == case)
+    plain = replace(first, case=Case("", arm=case.arm))
+    arms = build_task(spec, plain, on_warning=None).world.arms
+    hashes = {name: content_hash(arm.model) for name, arm in arms.items()}
+    if case.policy in (*POLICIES, NOMINAL):
+        return hashes
+    found = RunFolder(case.policy).policy_hash
+    return hashes if found is None else {**hashes, POLICY: found}
 
 
 def check_playable(

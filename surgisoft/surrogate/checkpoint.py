@@ -1,5 +1,6 @@
 """Model folders: `config.json` and `weights.safetensors`. Opening one runs no code of it."""
 
+import hashlib
 import json
 import os
 from collections.abc import Iterable
@@ -191,6 +192,21 @@ def save_model(
                 known.save(fresh)
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror or error})") from error
+
+
+def content_hash(model: ArmModel) -> str:
+    """sha256 in hex over what a model predicts from: its arm, network, effects and weights."""
+    config = {
+        "arm": asdict(model.spec),
+        "network": _network_config(model.network),
+        "effects": {name: effect.config() for name, effect in model.effects.items()},
+        "effect_files": [file["sha256"] for file in files_of(model.effects).values()],
+    }
+    digest = hashlib.sha256(json.dumps(config, sort_keys=True).encode())
+    for name, value in sorted(model.state_dict().items()):
+        digest.update(f"{name} {tuple(value.shape)} {value.dtype}\n".encode())
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def _place(folder: str | Path) -> Path:

@@ -28,6 +28,7 @@ from surgisoft.experiments.session import (
 )
 from surgisoft.experiments.spec import Fault, Lesion, load_experiment, save_experiment
 from surgisoft.files import write_json
+from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.circle_ablation import CircleAblation
 from surgisoft.tasks.laser_supervision import LaserSupervision
@@ -301,6 +302,53 @@ def test_processes_beside_a_cluster_are_refused(tmp_path, monkeypatch, capsys):
     with pytest.raises(InputError, match="--processes 2 has no effect"):
         run_experiment(spec_of(tmp_path), out, processes=2, cluster="tcp://host:8786")
     assert not out.exists()
+
+
+def test_results_go_on_only_with_their_own_policy_and_arm_models(tmp_path):
+    """The run's checkpoint and the arm model are those of another training, in the same folders.
+
+    A case whose episodes are all there goes on as it is: nothing of it is computed again. Results
+    of before, which state the scene alone, go on, too."""
+    run_folder, arm = tmp_path / "run", tmp_path / "arm"
+    shutil.copytree(PACKAGED / "ring", run_folder)
+    shutil.copytree(run_folder / "arms" / "laser", arm)
+    cases = (
+        f'[[cases]]\nname = "learned"\npolicy = "{run_folder}"\n'
+        f'[[cases]]\nname = "ours"\narm = "{arm}"\n'
+    )
+    spec, folder = spec_of(tmp_path, TINY + cases), tmp_path / "results"
+    open_results(spec, folder)
+    open_results(spec, folder, resume=True)
+
+    checkpoint = run_folder / "checkpoints" / "best.pt"
+    kept, saved = checkpoint.read_bytes(), torch.load(checkpoint, weights_only=True)
+    weights = saved["agents"]["laser"]
+    name = next(name for name, value in weights.items() if value.is_floating_point())
+    weights[name] = weights[name] + 0.01
+    torch.save(saved, checkpoint)
+    said = "the policy '.*run' of its case 'learned' has changed since the results began"
+    with pytest.raises(InputError, match=said):
+        open_results(spec, folder, resume=True)
+    checkpoint.write_bytes(kept)
+    open_results(spec, folder, resume=True)
+
+    other = load_model(arm)
+    with torch.no_grad():
+        next(iter(other.parameters())).add_(0.01)
+    save_model(other, arm, force=True)
+    said = "the arm model of '(laser|endoscope)' of its case 'ours' has changed since the results"
+    with pytest.raises(InputError, match=said):
+        open_results(spec, folder, resume=True)
+    file = folder / "versions.json"
+    about = json.loads(file.read_text())
+    write_json(file, {name: value for name, value in about.items() if name != "cases"})
+    open_results(spec, folder, resume=True)
+    write_json(file, about)
+    for job in jobs(spec):
+        for episode in range(job.first, job.first + job.count):
+            if job.setting.case.name == "ours":
+                write_json(row_file(folder, job.setting, episode), {})
+    open_results(spec, folder, resume=True)
 
 
 @pytest.mark.parametrize(

@@ -247,6 +247,15 @@ class RunFolder:
         """The task that the run trains, from the folder alone."""
         return make_task(self.config["task"], self._task_config(), device)
 
+    def arm_parts(self, name: str) -> tuple[bytes, ...] | None:
+        """Content of the files that an arm's model is opened from; None without such an arm."""
+        folder = self.path / "arms" / name
+        if not folder.is_dir():
+            return None
+        config = read_json(folder / "config.json")
+        parts = [config.get(part) for part in ("arm", "network", "effects")]
+        return json.dumps(parts).encode(), (folder / "weights.safetensors").read_bytes()
+
     def checkpoint(self, which: str) -> Path:
         """The file of `last` or `best`."""
         return self.path / "checkpoints" / f"{which}.pt"

@@ -43,6 +43,15 @@ if TYPE_CHECKING:
     from surgisoft.agents.on_rig import RigConfig
 
 
+NOT_COMPARED = {"scene", "arm", "weights"}
+"""Parts of the names of a configuration's fields that a warning leaves out: folders of the run
+itself, whose content is compared, and weights of the reward, on which no measure depends."""
+MOST_FIELDS = 4
+"""Most fields that a warning lists."""
+LONGEST_VALUE = 40
+"""Longest text of a list that a warning shows (characters)."""
+
+
 def task_config(
     task: str,
     config: Any = None,
@@ -167,9 +176,9 @@ class EvaluationRequest:
         config = self.config
         if config is None and brought:
             config = brought[0].plan().task_config
+            self._warn_of_fields(brought, on_warning)
         config = task_config(task, config, self.arm, self.scene)
-        if self.scene is not None or self.config is not None:
-            self._warn_of_scenes(brought, config, on_warning)
+        self._warn_of_scenes(brought, config, on_warning)
         return make_task(task, config), config
 
     def _warn_of_scenes(
@@ -178,16 +187,65 @@ class EvaluationRequest:
         """Warn of runs that were trained in another scene than that of a configuration."""
         place = getattr(config, "scene", None)
         trained = [run for run in runs if run.config["scene"]]
-        if place is None or not trained:
+        given = self.scene is not None or self.config is not None
+        if place is None or not (trained if given else trained[1:]):
             return
+        name = Path(place).name if given else f"{_scene_of(trained[0])} of {trained[0].path}"
         here = _geometry(open_scene(place))
         for run in trained:
             if _geometry(open_scene(run.path / "scene")) != here:
-                there = Path(run.config["scene"]["from"]).name
                 on_warning(
-                    f"{run.path} was trained in another scene ({there}) than "
-                    f"{Path(place).name}; its result here says nothing about the scene: train there"
+                    f"{run.path} was trained in another scene ({_scene_of(run)}) than {name}; its "
+                    "result here says nothing about the scene: train there"
                 )
+
+    def _warn_of_fields(self, runs: list[RunFolder], on_warning: Callable[[str], None]) -> None:
+        """Warn of runs whose arm models, or fields of the configuration, are not those of the first
+        run, in whose world all act."""
+        first = runs[0]
+        here = _leaves(to_table(first.plan().task_config))
+        for run in runs[1:]:
+            there = _leaves(to_table(run.plan().task_config))
+            differ = [
+                f"{name} = {_shown(there.get(name))} in place of {_shown(here.get(name))}"
+                for name in {**here, **there}
+                if here.get(name) != there.get(name) and not NOT_COMPARED & {*name.split(".")}
+            ]
+            if self.arm is None and self.scene is None:
+                differ += [
+                    f"another model of the arm '{name}'"
+                    for name in run.config["arms"]
+                    if run.arm_parts(name) != first.arm_parts(name)
+                ]
+            if differ:
+                more = f" and {len(differ) - MOST_FIELDS} more" if len(differ) > MOST_FIELDS else ""
+                on_warning(
+                    f"{run.path} was trained with {', '.join(differ[:MOST_FIELDS])}{more}; it is "
+                    f"evaluated in the configuration of {first.path}: evaluate it alone for its own"
+                )
+
+
+def _scene_of(run: RunFolder) -> str:
+    """Name of the scene that a run was trained in."""
+    return Path(run.config["scene"]["from"]).name
+
+
+def _leaves(table: Any, above: str = "") -> dict[str, Any]:
+    """The values of a nested table by their dotted names."""
+    if not isinstance(table, dict):
+        return {above: table}
+    parts = [_leaves(part, f"{above}.{name}".lstrip(".")) for name, part in table.items()]
+    return {name: value for part in parts for name, value in part.items()}
+
+
+def _shown(value: Any) -> str:
+    """A value of a configuration in words; a long list by its length."""
+    text = str(value)
+    return (
+        text
+        if len(text) <= LONGEST_VALUE or not isinstance(value, list)
+        else (f"a list of {len(value)}")
+    )
 
 
 def _geometry(scene: Scene) -> str:

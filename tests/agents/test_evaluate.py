@@ -14,10 +14,12 @@ from scipy.stats import binomtest
 from surgisoft.agents.evaluate import Evaluation, episode_table, student, summary, wilson
 from surgisoft.agents.exact_checks import Contact, EpisodeCheck
 from surgisoft.agents.rollout import Rollout
+from surgisoft.agents.run_folder import PACKAGED
 from surgisoft.agents.session import EvaluationRequest, evaluate
 from surgisoft.cli import run
 from surgisoft.errors import Interrupted
 from surgisoft.scene.spec import PHANTOM
+from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.tasks.circle_ablation import CircleAblation
 from surgisoft.tasks.registry import make_task, read_config
 
@@ -289,6 +291,36 @@ def test_a_policy_of_another_scene_is_warned_of(tmp_path):
         EvaluationRequest(("ring",), scene=scene).resolved(told.append)
     assert len(told) == 1
     assert "ring was trained in another scene (phantom_liver) than other" in told[0]
+
+
+def test_a_run_is_warned_of_that_acts_in_the_world_of_another_one(tmp_path):
+    """Two runs on one task: scene, a field, and one arm model of the second differ."""
+    first, second = tmp_path / "first", tmp_path / "second"
+    for folder in (first, second):
+        shutil.copytree(PACKAGED / "ring", folder)
+    told = []
+    EvaluationRequest((str(first), str(second))).resolved(told.append)
+    assert told == []
+    scene = second / "scene" / "scene.toml"
+    scene.write_text(scene.read_text().replace("diameter_mm = 20.0", "diameter_mm = 18.0", 1))
+    about = json.loads((second / "config.json").read_text())
+    about["task_config"]["fire_mm"] = 0.75
+    about["task_config"]["weights"]["laser"]["fine"] = 3.0
+    (second / "config.json").write_text(json.dumps(about))
+    model = load_model(second / "arms" / "laser")
+    with torch.no_grad():
+        next(iter(model.parameters())).add_(0.01)
+    save_model(model, second / "arms" / "laser", force=True)
+    _, config = EvaluationRequest((str(first), str(second))).resolved(told.append)
+    assert config.fire_mm == 0.5
+    fields, scenes = told
+    assert f"{second} was trained with fire_mm = 0.75 in place of 0.5, another model" in fields
+    assert fields.count("in place of") == 1
+    assert "another model of the arm 'laser'; it is evaluated" in fields
+    assert scenes.startswith(f"{second} was trained in another scene (phantom_liver) than")
+    told.clear()
+    EvaluationRequest((str(second),)).resolved(told.append)
+    assert told == []
 
 
 def test_the_command_imports_nothing_of_pictures_and_training():

@@ -9,7 +9,9 @@ that normal.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -23,6 +25,9 @@ FINE_MM = 0.2
 """Spacing of a path's points while it is laid on the surface (mm)."""
 GRID_MM = 0.1
 """Cell of the grid on which an outline is grown (mm); the outline is between its nodes, linear."""
+OUTSIDE_PITCHES = 0.5
+"""Share of a raster's pitch by which the way from one line to the next may lead farther outside
+than the lines reach: outlines are not quite convex as seen along their normal."""
 MOST_NODES = 4_000_000
 """Most nodes of that grid: 200 x 200 mm."""
 
@@ -199,11 +204,13 @@ def _inside(points: np.ndarray, polygon: np.ndarray) -> np.ndarray:
 
 def raster(
     mesh: Mesh, outline_mm: np.ndarray, pitch_mm: float, inset_mm: float, step_mm: float
-) -> SurfacePath:
-    """An open path in parallel lines over the inside of a closed outline (N, 3) mm on the mesh.
+) -> tuple[SurfacePath, ...]:
+    """Open paths in parallel lines over the inside of a closed outline (N, 3) mm on the mesh.
 
-    Lines are pitch_mm apart and run to and fro (boustrophedon) along the outline's longer side, at
-    least inset_mm inside of it (negative: so far beyond it). The points are about step_mm apart.
+    Lines are pitch_mm apart and run to and fro along the outline's longer side, at least inset_mm
+    inside of it (negative: so far beyond it). The points are about step_mm apart. A convex outline
+    has one path. A concave one is divided where a line has a gap (boustrophedon cells, Choset 2000,
+    Auton. Robots 9:247), and where the way from one line to the next leads outside.
     """
     plane = Plane.of(mesh, outline_mm)
     polygon = plane.flat(outline_mm)
@@ -213,17 +220,66 @@ def raster(
     room = max(0.0, float(high[1] - low[1]))
     count = max(1, round(room / pitch_mm) + 1)
     rows = 0.5 * (low[1] + high[1]) + pitch_mm * (np.arange(count) - 0.5 * (count - 1))
-    corners: list[np.ndarray] = []
+    along = np.arange(low[0], high[0] + 0.5 * FINE_MM, FINE_MM)
+    lines: list[list[np.ndarray]] = []
     for number, row in enumerate(rows):
-        along = np.arange(low[0], high[0] + 0.5 * FINE_MM, FINE_MM)
         line = np.stack((along, np.full_like(along, row)), axis=1)
-        inner = line[signed_distance_mm(line, turned) <= -inset_mm + 1e-9]
-        if len(inner):
-            corners += [inner if number % 2 == 0 else inner[::-1]]
+        inside = np.flatnonzero(signed_distance_mm(line, turned) <= -inset_mm + 1e-9)
+        parts = np.split(inside, np.flatnonzero(np.diff(inside) > 1) + 1) if len(inside) else []
+        lines.append([line[part] if number % 2 == 0 else line[part[::-1]] for part in parts])
+    outside_mm = -inset_mm + OUTSIDE_PITCHES * pitch_mm
+    corners = [
+        np.concatenate(piece)
+        for cell in _cells(lines)
+        for piece in _unbroken(cell, turned, outside_mm)
+        if sum(map(len, piece)) > 1
+    ]
     if not corners:
         raise InputError(f"no line fits {inset_mm:g} mm inside the outline; choose a smaller inset")
-    flat = np.concatenate(corners) @ sides
-    return laid(mesh, plane.on(mesh, flat, "the raster"), False, step_mm, "raster")
+    return tuple(
+        laid(mesh, plane.on(mesh, each @ sides, "the raster"), False, step_mm, "raster")
+        for each in corners
+    )
+
+
+def _cells(lines: Sequence[Sequence[np.ndarray]]) -> list[list[np.ndarray]]:
+    """Parts (P, 2) of successive lines in cells of one part of each line.
+
+    A part belongs to the cell of the one part beside it in the line before, unless that one has
+    several parts beside it.
+    """
+    cells: list[list[np.ndarray]] = []
+    last: list[int] = []  # numbers of the cells in the line before
+    for parts in lines:
+        beside = [[k for k in last if _overlap(cells[k][-1], part)] for part in parts]
+        last = []
+        for part, near in zip(parts, beside, strict=True):
+            if len(near) != 1 or sum(near[0] in others for others in beside) != 1:
+                near = [len(cells)]
+                cells.append([])
+            cells[near[0]].append(part)
+            last.append(near[0])
+    return cells
+
+
+def _overlap(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two parts (P, 2) of parallel lines lie beside each other."""
+    (a, b), (c, d) = (sorted((part[0, 0], part[-1, 0])) for part in (one, other))
+    return bool(a <= d and c <= b)
+
+
+def _unbroken(
+    cell: Sequence[np.ndarray], polygon: np.ndarray, outside_mm: float
+) -> list[list[np.ndarray]]:
+    """The parts (P, 2) of a cell in pieces within which no way from one part to the next leads
+    farther than outside_mm out of the polygon (N, 2)."""
+    pieces = [[cell[0]]]
+    for before, part in pairwise(cell):
+        way = resampled(np.stack((before[-1], part[0])), FINE_MM)
+        if signed_distance_mm(way, polygon).max() > outside_mm:
+            pieces.append([])
+        pieces[-1].append(part)
+    return pieces
 
 
 def _circle(mesh: Mesh, contour: ContourSpec, name: str) -> np.ndarray:

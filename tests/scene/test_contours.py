@@ -76,7 +76,7 @@ def test_a_margin_that_closes_a_gap_leaves_the_outer_line(plane):
 
 def test_a_raster_covers_a_disc_by_hand(plane):
     """Rows 1.25 mm apart within 9 mm of the middle: chords, joined by straight lines."""
-    path = raster(plane, disc(10.0), 1.25, 1.0, 0.2)
+    (path,) = raster(plane, disc(10.0), 1.25, 1.0, 0.2)
     rows = 1.25 * (np.arange(15) - 7.0)
     half = np.sqrt(81.0 - rows**2)
     across = np.hypot(1.25, np.diff(half))
@@ -85,6 +85,30 @@ def test_a_raster_covers_a_disc_by_hand(plane):
     assert np.linalg.norm(path.points_mm[:, :2], axis=1).max() <= 9.0 + 1e-6
     assert not path.closed
     assert len(np.unique(path.points_mm[:, 1].round(1))) >= 15
+
+
+@pytest.mark.parametrize("turned", [1.0, -1.0])
+def test_a_raster_leaves_the_notch_of_a_concave_outline_alone(plane, turned):
+    """A U, 20 x 10 mm, with a notch of 5 x 6 mm: a base of 4 mm, and two arms of 7.5 x 6 mm.
+
+    No point is farther outside than the overrun and the allowance of the ways between lines, all
+    of the U is within half a pitch of a line, and the paths are three."""
+    corners = [(-10, -5), (10, -5), (10, 5), (2.5, 5), (2.5, -1), (-2.5, -1), (-2.5, 5), (-10, 5)]
+    outline = np.array([(x, turned * y, 5.0) for x, y in corners])
+    paths = raster(plane, outline, 1.25, -0.5, 0.25)
+    assert len(paths) == 3
+    every = np.concatenate([path.points_mm for path in paths])
+    away = signed_distance_mm(every[:, :2], outline[:, :2])
+    assert away.max() <= 0.5 + 0.5 * 1.25 + 1e-6
+    for path in paths:
+        steps = np.linalg.norm(np.diff(path.points_mm, axis=0), axis=1)
+        assert steps.max() <= 0.25 + 1e-6
+    grid = np.stack(np.meshgrid(np.linspace(-10, 10, 81), np.linspace(-5, 5, 41)), -1).reshape(
+        -1, 2
+    )
+    within = grid[signed_distance_mm(grid, outline[:, :2]) < 0.0]
+    gaps = np.linalg.norm(within[:, None] - every[None, :, :2], axis=2).min(axis=1)
+    assert gaps.max() <= 0.5 * 1.25 + 0.25
 
 
 def test_the_zones_of_paths_have_the_areas_by_hand(plane):
@@ -111,7 +135,8 @@ def test_an_area_and_its_dose_by_hand(plane):
         [25.0 * math.pi, (36.0 - 25.0) * math.pi, (64.0 - 36.0) * math.pi], rel=0.02
     )
     ablation = AblationMap(patch, 0.5, depth_mm=0.1, exact_lesion=True)
-    points = torch.tensor(raster(plane, outline.points_mm, 0.6, 0.3, 0.5).points_mm).float()
+    (path,) = raster(plane, outline.points_mm, 0.6, 0.3, 0.5)
+    points = torch.tensor(path.points_mm).float()
     down, on = torch.tensor([[0.0, 0.0, -1.0]]), torch.tensor([True])
     state = ablation.start(points[:1], down, on)
     for point in points[1:]:

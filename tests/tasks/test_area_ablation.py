@@ -2,11 +2,16 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from surgisoft.errors import InputError
-from surgisoft.scene.spec import ContourSpec
+from surgisoft.scene import frames
+from surgisoft.scene.contours import Plane, resampled, signed_distance_mm
+from surgisoft.scene.folder import open_scene
+from surgisoft.scene.lesion import nearest_on_surface
+from surgisoft.scene.spec import PHANTOM, ContourSpec
 from surgisoft.tasks.area_ablation import AreaAblation, AreaAblationConfig
 from surgisoft.tasks.base import Episodes
 
@@ -54,6 +59,32 @@ def test_healthy_tissue_beyond_the_margin_counts_against_it():
     terms = task.rewards(state)["laser"]
     torch.testing.assert_close(terms["healthy"], -0.1 * outcome.measures["healthy_mm2"])
     torch.testing.assert_close(terms["treated"], outcome.measures["completion"])
+
+
+def test_no_beam_crosses_the_notch_of_a_concave_outline():
+    """A U of 20 x 10 mm with a notch of 5 x 6 mm, on the phantom about its lesion.
+
+    Where the reference moves with the beam on it stays within the outline, the overrun of 0.5 mm
+    and the allowance of half a pitch between lines; over the notch it leaps."""
+    scene = open_scene(PHANTOM)
+    axes, centre = frames.rotation_from_z(scene.ring.normal), scene.ring.centre_mm
+    corners = [(-10, -5), (10, -5), (10, 5), (2.5, 5), (2.5, -1), (-2.5, -1), (-2.5, 5), (-10, 5)]
+    fine = resampled(np.array([*corners, corners[0]], float), 0.5)[:-1]
+    on, _ = nearest_on_surface(scene.organ.world_mesh, centre + fine @ axes[:, :2].T)
+    outline = ContourSpec("u", tuple(map(tuple, on.tolist())))
+    task = AreaAblation(AreaAblationConfig(outlines=(outline,), time_s=120.0))
+    assert [each.closed for each in task.scene.stretches] == [False] * 3
+    state = Episodes(task).seeded(0, 1)
+    plane, leaps = Plane.of(scene.organ.world_mesh, on), 0
+    for done in range(state.goal.steps - 1):
+        here = replace(state, goal=replace(state.goal, done=torch.tensor([done])))
+        if task.leaps(here).item():
+            leaps += 1
+            continue
+        both = [task.target_mm(here, ahead)[0].double().numpy() for ahead in (0, 1)]
+        way = plane.flat(np.linspace(*both, 5))
+        assert signed_distance_mm(way, plane.flat(on)).max() <= 0.5 + 0.6 + 0.05
+    assert 1 <= leaps <= 2
 
 
 def test_success_by_hand():

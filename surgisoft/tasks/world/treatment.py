@@ -209,15 +209,17 @@ class AreaPlan:
         ratio = self.dose_j_per_mm2 / tissue.threshold_j_per_mm2
         around = outlines(scene, self.contours or (_ring(scene),), 0.0, FINE_STEP_MM)
         patch = area_patch(mesh, around, SPACING_WAISTS * 0.5 * self.spot_mm, self.spared_mm)
-        lines = [
-            replace(
-                raster(mesh, one.points_mm, self.pitch_mm, -self.overrun_mm, self.step_mm),
-                name=one.name,
-            )
+        rasters = [
+            raster(mesh, one.points_mm, self.pitch_mm, -self.overrun_mm, self.step_mm)
             for one in around
         ]
+        lines = [
+            replace(line, name=one.name)
+            for one, parts in zip(around, rasters, strict=True)
+            for line in parts
+        ]
         looks = [_spread(one, view_points) for one in around]
-        counts = [len(line.points_mm) for line in lines]
+        counts = [sum(len(line.points_mm) for line in parts) for parts in rasters]
         return _joined(
             patch,
             self.spot_mm,

@@ -26,6 +26,7 @@ from surgisoft.experiments.spec import (
 from surgisoft.rig.hidden import HIDDEN
 from surgisoft.rig.registry import SIMULATED, hidden_of, parse_rig
 from surgisoft.scene.folder import Scene, open_scene
+from surgisoft.scene.lesion import distance_from_ring_mm
 from surgisoft.tasks.registry import with_fields, with_present_names
 
 Value = int | float | str
@@ -212,9 +213,17 @@ def scene_of(spec: Experiment, setting: Setting) -> Scene:
     moved = scene.with_lesion(lesion)
     moved = dataclasses.replace(moved, spec=dataclasses.replace(moved.spec, contours=()))
     try:
-        moved.ring  # noqa: B018  (an InputError where it does not lie on the organ)
+        ring = moved.ring
     except InputError as error:
         raise InputError(f"lesion '{setting.lesion.name}': {error}") from None
+    least = moved.spec.limits.clearance_mm
+    for name, mesh in moved.keep_out.items():
+        if (away := distance_from_ring_mm(mesh, ring)) < least:
+            raise InputError(
+                f"lesion '{setting.lesion.name}': its ring is {away:.1f} mm from '{name}', "
+                f"expected at least {least:g} mm (clearance_mm of the scene); choose another place "
+                "or a smaller diameter"
+            )
     return moved
 
 

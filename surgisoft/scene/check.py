@@ -18,6 +18,7 @@ from surgisoft.scene.folder import Scene
 from surgisoft.scene.lesion import (
     ON_SURFACE_MM,
     circle_on,
+    distance_from_ring_mm,
     nearest_on_surface,
     path_off_mm,
     path_slack_mm,
@@ -259,13 +260,9 @@ def _neighbour_findings(scene: Scene) -> tuple[Finding, ...]:
     """Distance of the cut from each body that must not be touched, such as a vessel below it."""
     least = scene.spec.limits.clearance_mm
     rows = []
-    for body in scene.bodies:
-        if body.role == "keep-out":
-            nearest, _ = nearest_on_surface(body.world_mesh, scene.ring.points_mm)
-            away = float(np.linalg.norm(nearest - scene.ring.points_mm, axis=1).min())
-            rows.append(
-                Finding(f"ring to '{body.name}'", f"{away:.1f} mm", f"{least:g} mm", away >= least)
-            )
+    for name, mesh in scene.keep_out.items():
+        away = distance_from_ring_mm(mesh, scene.ring)
+        rows.append(Finding(f"ring to '{name}'", f"{away:.1f} mm", f"{least:g} mm", away >= least))
     return tuple(rows)
 
 

@@ -10,7 +10,7 @@ import tomli_w
 from surgisoft.config import read_toml, to_table
 from surgisoft.errors import InputError
 from surgisoft.scene.lesion import Ring, lesion_ring
-from surgisoft.scene.mesh import Body
+from surgisoft.scene.mesh import Body, Mesh
 from surgisoft.scene.meshio import read_mesh
 from surgisoft.scene.spec import FILE, LesionSpec, SceneSpec, load_spec, spec_path
 
@@ -30,6 +30,11 @@ class Scene:
     def organ(self) -> Body:
         """The body that carries the lesion."""
         return next(body for body in self.bodies if body.name == self.spec.lesion.body)
+
+    @property
+    def keep_out(self) -> dict[str, Mesh]:
+        """Bodies that must not be touched, by name: their meshes in the world frame."""
+        return {body.name: body.world_mesh for body in self.bodies if body.role == "keep-out"}
 
     @cached_property
     def ring(self) -> Ring:

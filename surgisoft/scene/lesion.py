@@ -7,6 +7,7 @@ an existing one for training.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -425,14 +426,27 @@ TRIES = 20
 """Places tried for each lesion before the variation is given up."""
 
 
+def distance_from_ring_mm(mesh: Mesh, ring: Ring) -> float:
+    """Distance of a mesh's surface from the points of a ring, both in the world frame (mm)."""
+    nearest, _ = nearest_on_surface(mesh, ring.points_mm)
+    return float(np.linalg.norm(nearest - ring.points_mm, axis=1).min())
+
+
 def lesions_like(
-    mesh: Mesh, lesion: LesionSpec, count: int, shift_mm: float, size: float
+    mesh: Mesh,
+    lesion: LesionSpec,
+    count: int,
+    shift_mm: float,
+    size: float,
+    keep_out: Mapping[str, Mesh] | None = None,
+    clearance_mm: float = 0.0,
 ) -> tuple[LesionSpec, ...]:
     """`count` random variations of a lesion on the organ's mesh (world frame), with a fixed seed.
 
     Centres are uniform within shift_mm of the lesion's centre, along the surface. Diameters are
-    uniform within the share `size` of its diameter (0.1: 90 to 110 %). With both at 0 the result is
-    the lesion itself.
+    uniform within the share `size` of its diameter (0.1: 90 to 110 %). Rings that come nearer than
+    clearance_mm to a body of keep_out (name -> mesh, world frame) are left out. With shift_mm and
+    size at 0 the result is the lesion itself. Raises InputError where too few rings are found.
     """
     if shift_mm == 0.0 and size == 0.0:
         return (lesion,)
@@ -447,19 +461,30 @@ def lesions_like(
         )
     own, face = (part[0] for part in nearest_on_surface(mesh, np.array([lesion.centre_mm])))
     plane = frames.rotation_from_z(patch_normal(mesh, own, int(face), 0.5 * lesion.diameter_mm))
-    rng, found = np.random.default_rng(0), []
+    rng, found, too_near = np.random.default_rng(0), [], dict.fromkeys(keep_out or {}, 0)
     for _ in range(TRIES * count):
         turn, share, spread = rng.uniform((0.0, 0.0, -1.0), (2.0 * np.pi, 1.0, 1.0))
         aside = shift_mm * np.sqrt(share) * np.array([np.cos(turn), np.sin(turn)])
         diameter = lesion.diameter_mm * (1.0 + size * spread)
         centre, face = (part[0] for part in nearest_on_surface(mesh, own + plane[:, :2] @ aside))
-        if circle_on(mesh, centre, int(face), diameter) is not None:
+        ring = circle_on(mesh, centre, int(face), diameter)
+        near = [
+            name
+            for name, body in (keep_out or {}).items()
+            if ring is not None and distance_from_ring_mm(body, ring) < clearance_mm
+        ]
+        for name in near:
+            too_near[name] += 1
+        if ring is not None and not near:
             found.append(
                 replace(lesion, centre_mm=tuple(centre.tolist()), diameter_mm=float(diameter))
             )
         if len(found) == count:
             return tuple(found)
+    close = [f"'{name}'" for name, times in too_near.items() if times]
+    off = f" at least {clearance_mm:g} mm from {', '.join(close)}" if close else ""
     raise InputError(
         f"only {len(found)} of {count} lesions up to {shift_mm:g} mm aside and {100 * size:g} % "
-        f"larger fit on '{lesion.body}'; use a smaller spread or a flatter place"
+        f"larger fit on '{lesion.body}'{off}; use a smaller spread or "
+        f"{'another' if close else 'a flatter'} place"
     )

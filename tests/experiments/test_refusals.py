@@ -28,6 +28,7 @@ from surgisoft.experiments.session import (
 )
 from surgisoft.experiments.spec import Fault, Lesion, load_experiment, save_experiment
 from surgisoft.files import write_json
+from surgisoft.scene.spec import PHANTOM
 from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.circle_ablation import CircleAblation
@@ -101,6 +102,22 @@ def test_an_episode_has_an_end(tmp_path):
         InputError, match=r"time_s is 10000 s, more than 10,000,000 steps of 0\.001"
     ):
         build_task(longer, setting)
+
+
+def test_a_lesion_of_an_experiment_keeps_the_scenes_clearance(tmp_path):
+    """In `multi_lesion` the ring `right` is 47.4 mm from the gallbladder, `left` 54.1 mm."""
+    scene = tmp_path / "strict"
+    shutil.copytree(PHANTOM, scene)
+    file = scene / "scene.toml"
+    file.write_text(file.read_text().replace("clearance_mm = 1.0", "clearance_mm = 50.0", 1))
+    packaged = (PHANTOM / "experiments" / "multi_lesion.toml").read_text()
+    text = re.sub(r'^scene = ".*"', f'scene = "{scene}"', packaged, count=1, flags=re.MULTILINE)
+    spec = spec_of(tmp_path, text)
+    by_lesion = {setting.lesion.name: setting for setting in settings(spec)}
+    assert scene_of(spec, by_lesion["left"]).spec.lesion.body == "liver"
+    said = "lesion 'right': its ring is 47.4 mm from 'gallbladder', expected at least 50 mm"
+    with pytest.raises(InputError, match=said):
+        scene_of(spec, by_lesion["right"])
 
 
 def test_a_lesion_of_an_experiment_lies_on_the_organ(tmp_path):

@@ -210,6 +210,21 @@ def test_varied_lesions_are_uniform_in_place_and_diameter():
     assert diameters.mean() == pytest.approx(20.0, abs=0.4)
 
 
+def test_varied_lesions_keep_the_clearance_of_a_body_beside_them():
+    """Rings of 8 mm on a plane whose centres differ by up to 5 mm; a wall begins at x = 10 mm.
+
+    A ring keeps 3 mm where its centre is at x <= 3 mm: 10 - 3 - 4."""
+    lesion = LesionSpec("box", (0.0, 0.0, 40.0), 8.0)
+    wall = box((20.0, 60.0, 60.0))
+    wall = type(wall)(wall.vertices_mm + np.array([20.0, 0.0, 40.0]), wall.faces)
+    free = lesions_like(BOX, lesion, 60, 5.0, 0.0)
+    kept = lesions_like(BOX, lesion, 30, 5.0, 0.0, {"wall": wall}, 3.0)
+    assert max(each.centre_mm[0] for each in free) > 3.5
+    assert kept == tuple(each for each in free if each.centre_mm[0] <= 3.0)[:30]
+    with pytest.raises(InputError, match=r"fit on 'box' at least 12 mm from 'wall'; use a smaller"):
+        lesions_like(BOX, lesion, 4, 5.0, 0.0, {"wall": wall}, 12.0)
+
+
 @given(seed=st.integers(0, 1000))
 def test_a_direction_finds_the_side_that_faces_it(seed):
     direction = np.random.default_rng(seed).normal(size=3)

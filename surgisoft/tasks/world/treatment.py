@@ -126,7 +126,8 @@ def rings(scene: Scene, vary: Randomisation, band_mm: float, view_points: int) -
     spec = scene.spec
     mesh, spot = scene.organ.world_mesh, spec.laser.spot_mm
     place = (vary.lesions, vary.lesion_mm, vary.lesion_size)
-    scenes = [scene.with_lesion(one) for one in lesions_like(mesh, spec.lesion, *place)]
+    off = scene.keep_out, spec.limits.clearance_mm
+    scenes = [scene.with_lesion(one) for one in lesions_like(mesh, spec.lesion, *place, *off)]
     around = [(one.ring.points_mm, one.ring.normals, one.ring.centre_mm) for one in scenes]
     looks = [one.ring_of(count=view_points) for one in scenes]
     paths = [one.ring_of(count=PATH_POINTS) for one in scenes]

@@ -133,13 +133,15 @@ def check(
 ) -> None:
     """Check an experiment's file and list its phases and settings, without running it."""
     from surgisoft.experiments.plan import settings
-    from surgisoft.experiments.run import check_playable
+    from surgisoft.experiments.run import check_playable, short_trainings
     from surgisoft.experiments.session import open_experiment
 
     spec = open_experiment(file)
     found = settings(spec)
     with progress("experiment check") as report:
         clear_mm = check_playable(spec, progress=report)
+    for line in short_trainings(spec):
+        warn(line)
     episodes = counted(len(found) * spec.repeats, "episode")
     print(
         f"{spec.name} ({spec.scenario}): {counted(len(found), 'setting')}, {episodes} of at most "

@@ -228,6 +228,24 @@ def check_playable(
     return clear_mm
 
 
+def short_trainings(spec: Experiment) -> list[str]:
+    """One line for each policy that was trained in shorter episodes than those of the experiment:
+    what it does after the end of such an episode, it never learned."""
+    lines = []
+    for policy in dict.fromkeys(case.policy for case in spec.cases):
+        if policy in (*POLICIES, NOMINAL):
+            continue
+        task = RunFolder(policy).task()
+        trained_s = task.steps * task.world.config.dt_s
+        if spec.limits.time_s > trained_s + 0.5 * task.world.config.dt_s:
+            lines.append(
+                f"{policy} was trained in episodes of {trained_s:g} s, and those of {spec.name} "
+                f"last up to {spec.limits.time_s:g} s: from {trained_s:g} s on it observes the "
+                "end of its episode"
+            )
+    return lines
+
+
 def _as_built(spec: Experiment, setting: Setting) -> Setting:
     """The setting without what no task needs to be built: equal for settings that are built alike.
 

@@ -15,7 +15,14 @@ from torch import Tensor
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Signal, TaskState, check_weights, clearance, weighted
 from surgisoft.tasks.inverse_kinematics import action_towards
-from surgisoft.tasks.observations import TIME, Block, ObservationBlocks, body_blocks, joined
+from surgisoft.tasks.observations import (
+    TIME,
+    Block,
+    ObservationBlocks,
+    body_blocks,
+    elapsed,
+    joined,
+)
 from surgisoft.tasks.spec import TaskSpec
 from surgisoft.tasks.trajectories.waypoints import (
     WaypointSequence,
@@ -190,7 +197,7 @@ class Keyhole:
                 ONWARD: (onward - tip).asinh(),
                 CLEARANCE: clearance(state).least_mm[:, None] / 10.0,
                 VISITS: state.goal.reached[:, None] / self.config.visits,
-                TIME: state.world.steps[:, None] / self.steps,
+                TIME: elapsed(state.world.steps, self.steps),
             }
         }
 

@@ -35,6 +35,7 @@ from surgisoft.tasks.observations import (
     Block,
     ObservationBlocks,
     body_blocks,
+    elapsed,
     joined,
     numbered,
 )
@@ -478,7 +479,7 @@ class OneLaserTask(LaserTask[Progress]):
             **self.shared_blocks(state),
             VIEW: self.reading(VIEW_FRACTION, state)[:, None],
             FIRED: state.goal.fired[:, None].float(),
-            TIME: state.world.steps[:, None] / self.steps,
+            TIME: elapsed(state.world.steps, self.steps),
             APART: (laser.seen_mm[:, -1] - eye.seen_mm[:, -1]) / 50.0,
         }
         return {

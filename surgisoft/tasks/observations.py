@@ -104,6 +104,12 @@ REVERSAL = Block(
 TIME = Block("time", "elapsed share of the episode", "-", "x", 0.0, 1.0)
 
 
+def elapsed(steps: Tensor, of: int) -> Tensor:
+    """(B, 1) 0..1: share of an episode of `of` steps after steps (B,); 1 beyond its end, where an
+    experiment gives the task more time."""
+    return (steps[:, None] / of).clamp(max=1.0)
+
+
 def free_points(points_mm: Tensor) -> Tensor:
     """(B, k, 3) mm: the key points (B, n, 3) mm without the base, which is the first of several."""
     return points_mm[:, min(1, points_mm.shape[1] - 1) :]

@@ -17,6 +17,7 @@ from surgisoft.tasks.observations import (
     Block,
     ObservationBlocks,
     asinh_of,
+    elapsed,
     free_points,
     joined,
     numbered,
@@ -288,7 +289,7 @@ class Follow:
         blocks |= pressure_blocks(self.arm, part)
         blocks[PRESSURE_HISTORY] = history.kPa.flatten(1)
         blocks[POINT_HISTORY] = history.mm.flatten(1)
-        blocks[TIME] = 2.0 * state.world.steps[:, None] / self.steps - 1.0
+        blocks[TIME] = 2.0 * elapsed(state.world.steps, self.steps) - 1.0
         return {"arm": blocks}
 
     def observe(self, state: TaskState[FollowGoal]) -> dict[str, Tensor]:

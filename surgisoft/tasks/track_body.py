@@ -17,6 +17,7 @@ from surgisoft.tasks.inverse_kinematics import action_towards
 from surgisoft.tasks.observations import (
     Block,
     ObservationBlocks,
+    elapsed,
     free_points,
     joined,
     numbered,
@@ -154,7 +155,7 @@ class TrackBody:
                 SHAPE: free_points(part.steered_mm - self._rest).flatten(1) / 10.0,
                 **numbered(ERROR, errors),
                 **pressure_blocks(self.arm, part),
-                TIME: 2.0 * state.world.steps[:, None] / self.steps - 1.0,
+                TIME: 2.0 * elapsed(state.world.steps, self.steps) - 1.0,
             }
         }
 

@@ -34,7 +34,14 @@ from surgisoft.tasks.laser_work import (
     lesion,
     view,
 )
-from surgisoft.tasks.observations import TIME, Block, ObservationBlocks, body_blocks, numbered
+from surgisoft.tasks.observations import (
+    TIME,
+    Block,
+    ObservationBlocks,
+    body_blocks,
+    elapsed,
+    numbered,
+)
 from surgisoft.tasks.spec import TaskSpec
 from surgisoft.tasks.trajectories.closed_path import draw_traversal, point_on_closed
 from surgisoft.tasks.world.arm import ArmPart
@@ -348,7 +355,7 @@ class TwoLaserRing(LaserTask[SharedCut]):
                 **body_blocks(self.world.arms[name], arms[name]),
                 **own[name],
                 VIEW: self.reading(VIEW_FRACTION, state)[:, None],
-                TIME: state.world.steps[:, None] / self.steps,
+                TIME: elapsed(state.world.steps, self.steps),
                 APART: torch.cat([tips[o] - tips[name] for o in AGENTS if o != name], 1) / 50.0,
             }
             for name in AGENTS

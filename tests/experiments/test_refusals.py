@@ -33,6 +33,7 @@ from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.circle_ablation import CircleAblation
 from surgisoft.tasks.laser_supervision import LaserSupervision
+from surgisoft.tasks.observations import TIME
 from surgisoft.tasks.registry import with_fields
 from tests.experiments.tiny import FAULT, TINY, write
 from tests.rig.own_rig import OwnRig
@@ -102,6 +103,26 @@ def test_an_episode_has_an_end(tmp_path):
         InputError, match=r"time_s is 10000 s, more than 10,000,000 steps of 0\.001"
     ):
         build_task(longer, setting)
+
+
+def test_time_stays_within_its_range_in_longer_experiments(tmp_path, capsys):
+    """The packaged policy was trained in episodes of 60 s; the experiment lasts 90 s."""
+    text = TINY.replace("time_s = 0.5", "time_s = 90.0")
+    file = write(tmp_path, text + '[[cases]]\nname = "learned"\npolicy = "ring"\n')
+    spec = load_experiment(file)
+    task = build_task(spec, settings(spec)[0])
+    assert (task.base.steps, task.steps) == (600, 900)
+    state = Episodes(task).seeded(0, 3)
+    steps = torch.tensor([150, 600, 900])
+    state = replace(state, world=replace(state.world, steps=steps))
+    for blocks in task.base.blocks(task.plain(state)).values():
+        assert blocks[TIME].squeeze(1).tolist() == [0.25, 1.0, 1.0]
+    assert run(["experiment", "check", str(file)]) == 0
+    said = capsys.readouterr().err
+    assert "ring was trained in episodes of 60 s, and those of tiny last up to 90 s" in said
+    file = write(tmp_path, file.read_text().replace("time_s = 90.0", "time_s = 60.0"))
+    assert run(["experiment", "check", str(file)]) == 0
+    assert "was trained in" not in capsys.readouterr().err
 
 
 def test_a_lesion_of_an_experiment_keeps_the_scenes_clearance(tmp_path):

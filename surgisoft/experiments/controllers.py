@@ -71,11 +71,17 @@ class Nominal:
     def act(
         self, task: PhasedTask, state: TaskState, observations: dict[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Actions of the expert on the state with nominal mounts, see `Policy.act`."""
-        arms = {
-            name: replace(part, mount=task.world.arms[name].pose.expand_as(part.mount))
-            for name, part in state.world.arms.items()
-        }
+        """Actions of the expert on the state with nominal mounts, see `Policy.act`.
+
+        A feed that has the bases still behind their mounts is known to the expert.
+        """
+        arms, out_mm = {}, state.world.out_mm
+        for name, part in state.world.arms.items():
+            pose = task.world.arms[name].pose
+            mount = pose.repeat(len(part.mount), 1, 1)
+            if out_mm is not None:
+                mount[:, :3, 3] -= out_mm[:, None] * pose[:3, 2]
+            arms[name] = replace(part, mount=mount)
         return task.script(replace(state, world=replace(state.world, arms=arms)))
 
 

@@ -50,7 +50,7 @@ COLOURS = 256
 ROOT = PAGES.parents[1]
 NOT_RUN = {
     "docs/rigs.md": "drives the devices of a laboratory; a rig of four methods is run by own_rig",
-    "docs/export.md": "reads a bench's samples; tests/agents/test_export.py runs controller.py",
+    "docs/export.md": "reads a bench's samples; tests/agents/test_export.py runs it",
 }
 """Guides whose Python cannot run without a robot, and what runs in their place."""
 PICTURE = re.compile(r"\]\(images/([\w-]+\.png)\)")

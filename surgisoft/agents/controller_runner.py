@@ -9,16 +9,20 @@ NumPy and that code alone, and is imported.
 
     controller = Controller("DIR")
     controller.reset()                                     # the arm is vented and at rest
-    controller.observe(p, points, commanded, dt)           # every sample, while you move the arm
-    command = controller.begin(p, points, commanded, dt)   # the episode begins with this sample
+    # every sample, while you move the arm
+    controller.observe(p, points, commanded, dt, **signals)
+    # the episode begins with this sample
+    command = controller.begin(p, points, commanded, dt, **signals)
     while not controller.done:
         ...                                                # set `command`, wait for a sample
-        command = controller.step(p, points, dt)           # every sample
+        command = controller.step(p, points, dt, **signals)  # every sample
 
 p: measured pressures (m,) kPa; points: measured key points (n, 3) mm in the frame of the arm's
 base, from the base to the tip, NaN where one is lost; commanded: set points (m,) kPa that are in
 force; dt: time since the sample before, s. With several arms each of them is a dict from the arm's
-name to its array, and so is the command. `policy.json` states every name, order, unit and range.
+name to its array, and so is the command. signals: measurements of the scene by their names, such
+as view_fraction=0.9, beam_on=1.0; none for a task without a scene. `policy.json` states every name,
+order, unit and range.
 """
 
 from __future__ import annotations

@@ -2,9 +2,12 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import onnx
@@ -217,6 +220,31 @@ def ring():
     task = make_task(policy.run.config["task"], config)
     config = replace(STRANGE, noise=1.0)
     return policy, task, drive(task, policy, config, build=ten_pictures_a_second)
+
+
+def test_the_example_of_the_page_drives_the_controller(ring, monkeypatch):
+    """The block of docs/export.md as it stands, with a bench whose arms do as they are told."""
+    policy, task, _ = ring
+    made = running(ControllerGraph(task, policy.actors))
+    made.about = {**made.about, "episode_steps": 3}
+    monkeypatch.setitem(sys.modules, "controller", SimpleNamespace(Controller=lambda folder: made))
+    page = (Path(__file__).parents[2] / "docs" / "export.md").read_text()
+    (block,) = re.findall(r"^```python\n(from controller import.*?)^```", page, re.S | re.M)
+    state = Episodes(task).seeded(0, 1)
+    points = {name: arm.model.rest_mm.numpy() for name, arm in task.world.arms.items()}
+    sent = [{name: part.command[0].numpy() for name, part in state.world.arms.items()}]
+
+    def next_sample():
+        return sent[-1], points, sent[-1], 0.1, {"view_fraction": 0.9, "beam_on": 0.0}
+
+    exec(block, {"next_sample": next_sample, "set_pressures": sent.append})
+    assert made.done
+    assert len(sent) == 1 + 3
+    for command in sent[1:]:
+        for name in task.agents:
+            assert command[name].min() >= 0.0, "lowest of the example's limits"
+            assert command[name].max() <= 40.0
+            np.testing.assert_array_equal(made.state(f"arms.{name}.plant.highest_kPa"), 40.0)
 
 
 def test_over_a_whole_episode_the_same_measurements_give_the_same_commands(ring):

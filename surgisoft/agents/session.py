@@ -38,6 +38,7 @@ from surgisoft.tasks.registry import (
     task_names,
     with_fields,
 )
+from surgisoft.tasks.world.reach import beam_beyond_limits
 
 if TYPE_CHECKING:
     from surgisoft.agents.on_rig import RigConfig
@@ -340,6 +341,8 @@ def evaluate(
     request = EvaluationRequest(names, task, **fields).under_rules()
     plain, config = request.resolved(on_warning)
     _warn_of_reach(plain, on_warning)
+    if beyond := beam_beyond_limits_of(config):
+        on_warning(beyond)
     place = plain
     if request.rig is not None:
         from surgisoft.agents.on_rig import on_rig
@@ -348,6 +351,15 @@ def evaluate(
     if request.rules is not None:
         plain, place = request.rules.over(plain), request.rules.over(place)
     return _evaluated(request, plain, place, config, progress)
+
+
+def beam_beyond_limits_of(config: Any) -> str:
+    """See `beam_beyond_limits`, of the scene of a task's configuration; empty without a scene, and
+    where the arms are not those of its mounts."""
+    place = getattr(config, "scene", None)
+    if place is None or getattr(config, "arm", None) is not None:
+        return ""
+    return beam_beyond_limits(open_scene(place))
 
 
 def _warn_of_reach(task: Task, on_warning: Callable[[str], None]) -> None:

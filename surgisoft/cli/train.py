@@ -74,16 +74,22 @@ def _assigned(changes: list[str], task: str | None, given: dict) -> str | None:
 
 
 def _show_plan(plan) -> None:
-    """Print what differs from the task's defaults and from the preset's hyper-parameters."""
+    """Print what differs from the task's defaults and from the preset's hyper-parameters, and warn
+    of a scene whose beams pass its own limits."""
     from surgisoft.agents.presets import preset_for
+    from surgisoft.agents.session import beam_beyond_limits_of
     from surgisoft.config import differences
     from surgisoft.tasks.registry import config_of
 
     lines = differences(config_of(plan.task), plan.task_config)
     usual = preset_for(plan.preset_name, plan.task)
     lines += [f"ppo.{line}" for line in differences(usual, plan.preset)]
-    if lines and os.environ.get("RANK", "0") == "0":
+    if os.environ.get("RANK", "0") != "0":
+        return
+    if lines:
         print("changed from the default:", *lines, sep="\n  ", flush=True)
+    if beyond := beam_beyond_limits_of(plan.task_config):
+        warn(beyond)
 
 
 @app.command()

@@ -18,7 +18,7 @@ from surgisoft.experiments.controllers import PhaseControllers
 from surgisoft.experiments.page import experiment_page, markdown, shown_episodes
 from surgisoft.experiments.phases import PhasedTask
 from surgisoft.experiments.pictures import film, write_pictures
-from surgisoft.experiments.plan import settings
+from surgisoft.experiments.plan import scene_of, settings
 from surgisoft.experiments.results import Results, drop_logs, sum_up, write_tables
 from surgisoft.experiments.run import DROPPED, open_results, run_experiment
 from surgisoft.experiments.spec import SCRIPTED, Experiment, load_experiment
@@ -30,6 +30,7 @@ from surgisoft.rig.registry import SIMULATED, check_rig, parse_rig
 from surgisoft.scene.spec import FILE as SCENE_FILE
 from surgisoft.scene.spec import MOST_LETTERS, PHANTOM, packaged_scene
 from surgisoft.tasks.base import Task
+from surgisoft.tasks.world.reach import beam_beyond_limits
 
 PACKAGED = PHANTOM / "experiments"
 """The experiments that come with the package."""
@@ -209,6 +210,8 @@ def finish_experiment(
     cluster: address of a Dask scheduler whose workers run the episodes. on_warning: gets each
     warning of the episodes once.
     """
+    for line in beams_beyond_limits(spec):
+        on_warning(line)
     rows = run_experiment(spec, folder, processes, progress, cluster, on_warning)
     results = sum_up(spec, folder, rows)
     files = write_tables(results)
@@ -222,6 +225,17 @@ def finish_experiment(
     summary = folder / "summary.md"
     write_atomically(summary, markdown(results))
     return results, [*files, summary]
+
+
+def beams_beyond_limits(spec: Experiment) -> list[str]:
+    """See `beam_beyond_limits`: one line for each lesion where a beam passes its scene's limits."""
+    if not spec.in_scene or getattr(spec.task, "arm", None) is not None:
+        return []
+    found = []
+    for setting in {setting.lesion: setting for setting in settings(spec)}.values():
+        if beyond := beam_beyond_limits(scene_of(spec, setting)):
+            found.append(f"lesion '{setting.lesion.name}': {beyond}" if setting.lesion else beyond)
+    return found
 
 
 def _write_replays(results: Results, progress: Progress) -> list[Path]:

@@ -245,9 +245,10 @@ class LaserSpec:
     ] = 9.0
     """Absorption by the tissue, 1/mm; liver: 0.745 of water's 12.4 at 1940 nm, Segelstein 1981."""
     standoff_mm: Range = (20.0, 60.0)
-    """Smallest and largest distance from the tip to the tissue (mm)."""
+    """Smallest and largest distance from the tip to the tissue (mm): of the search for mounts and
+    of `scene check`; tasks do not enforce it."""
     max_incidence_deg: Annotated[float, _between(0.0, 89.0, "degrees")] = 60.0
-    """Largest angle between the beam and the surface's normal (degrees)."""
+    """Largest angle between the beam and the surface's normal (degrees), used as `standoff_mm`."""
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,11 @@
 """Numbers of episodes and their intervals, held against tables, simulation and the command."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +20,14 @@ from surgisoft.agents.run_folder import PACKAGED
 from surgisoft.agents.session import EvaluationRequest, evaluate
 from surgisoft.cli import run
 from surgisoft.errors import Interrupted
+from surgisoft.scene.folder import open_scene
 from surgisoft.scene.spec import PHANTOM
 from surgisoft.surrogate.checkpoint import load_model, save_model
-from surgisoft.tasks.circle_ablation import CircleAblation
+from surgisoft.tasks.base import Episodes
+from surgisoft.tasks.circle_ablation import CircleAblation, CircleAblationConfig
 from surgisoft.tasks.registry import make_task, read_config
+from surgisoft.tasks.world.reach import beam_beyond_limits
+from surgisoft.tasks.world.world import WorldConfig
 
 NAN = float("nan")
 
@@ -291,6 +297,44 @@ def test_a_policy_of_another_scene_is_warned_of(tmp_path):
         EvaluationRequest(("ring",), scene=scene).resolved(told.append)
     assert len(told) == 1
     assert "ring was trained in another scene (phantom_liver) than other" in told[0]
+
+
+def test_a_beam_beyond_the_limits_of_its_scene_is_warned_of(tmp_path, capsys):
+    """The lengths are those of the beam in an episode of the expert, from 6 s to 12 s.
+
+    No task enforces the limits: with the beam too short and too steep the episode is the same."""
+    place = tmp_path / "strict"
+    shutil.copytree(PHANTOM, place)
+    file = place / "scene.toml"
+    text = file.read_text().replace("max_incidence_deg = 60.0", "max_incidence_deg = 30.0")
+    file.write_text(re.sub(r"standoff_mm = .*", "standoff_mm = [36.0, 60.0]", text))
+    said = beam_beyond_limits(open_scene(place))
+    found = re.search(r"of 'laser' is (\d+) to (\d+) mm long at the ring \(standoff_mm: 36 ", said)
+    task = make_task("circle_ablation")
+    episodes, lengths = Episodes(task), []
+    state = episodes.seeded(0, 4)
+    with torch.inference_mode():
+        for step in range(120):
+            state, _ = episodes.step(state, task.script(state))
+            if step >= 60:
+                tip = state.world.arms["laser"].points_mm[:, -1]
+                lengths.append((state.world.scene.hit.point_mm - tip).norm(dim=1))
+    lengths = torch.stack(lengths)
+    assert lengths.min() > float(found[1]) - 1.0
+    assert lengths.max() < float(found[2]) + 1.0
+    assert re.search(r"up to 33 degrees off the surface's normal \(max_incidence_deg: 30\)", said)
+    assert beam_beyond_limits(open_scene(PHANTOM)) == ""
+    told = []
+    call = {"episodes": 1, "exact_checks": False, "on_warning": told.append}
+    config = CircleAblationConfig(world=WorldConfig(dt_s=5.0))
+    evaluate("random", "circle_ablation", config=replace(config, scene=place), **call)
+    assert told == [said]
+    file = tmp_path / "e.toml"
+    file.write_text(
+        (PHANTOM / "experiments" / "liver.toml").read_text().replace('".."', f'"{place}"')
+    )
+    assert run(["experiment", "check", str(file)]) == 0
+    assert said in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_run_is_warned_of_that_acts_in_the_world_of_another_one(tmp_path):

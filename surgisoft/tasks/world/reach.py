@@ -11,6 +11,7 @@ import torch
 from surgisoft.config import Where, read_toml
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.scene.folder import Scene
+from surgisoft.scene.mounted_arm import MountedArm, solve_ring
 from surgisoft.scene.reach import ArmReach
 from surgisoft.scene.spec import FILE, TOOLS, MountSpec, arm_names, arm_rank
 from surgisoft.surrogate.arm import ArmSpec
@@ -95,6 +96,40 @@ def reaches_of(scene: Scene) -> dict[str, ArmReach]:
         name: reach_of(mount, scene.folder, where / "mounts" / i)
         for i, (name, mount) in enumerate(zip(names, scene.spec.mounts, strict=True))
     }
+
+
+def beam_beyond_limits(scene: Scene) -> str:
+    """In which way the beams around a scene's ring, solved for each arm alone, are longer, shorter
+    or steeper than the scene's `[laser]` states, in words; empty where none is, or where a mount
+    does not fit its model. Tasks do not enforce these limits."""
+    lasers, laser = scene.spec.arms_with("laser"), scene.spec.laser
+    try:
+        reaches = reaches_of(scene) if lasers else {}
+        ring = scene.ring
+    except InputError:
+        return ""
+    (low, high), worst = laser.standoff_mm, laser.max_incidence_deg
+    found = []
+    for name in lasers:
+        cut = solve_ring(MountedArm.at(scene.spec.mount(name), reaches[name]), ring, laser)
+        shortest, longest = float(cut.standoff_mm.min()), float(cut.standoff_mm.max())
+        steepest = float(np.degrees(cut.incidence_rad.max()))
+        if shortest < low or longest > high:
+            found.append(
+                f"the beam of '{name}' is {shortest:.0f} to {longest:.0f} mm long at the ring "
+                f"(standoff_mm: {low:g} to {high:g})"
+            )
+        if steepest > worst:
+            found.append(
+                f"the beam of '{name}' is up to {steepest:.0f} degrees off the surface's normal "
+                f"(max_incidence_deg: {worst:g})"
+            )
+    if not found:
+        return ""
+    return (
+        f"scene '{scene.spec.name}': {'; '.join(found)}; no task enforces these limits: "
+        "'surgisoft scene check' shows where they are passed"
+    )
 
 
 def _model_folder(mount: MountSpec, folder: Path | None, where: Where | None) -> Path | None:

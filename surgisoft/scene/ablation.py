@@ -135,7 +135,8 @@ class RingReport:
     width_mm: torch.Tensor
     """Mean width of the cut where the ring is cut (mm), within the band; 0 for no cut."""
     healthy_mm2: torch.Tensor
-    """Area of healthy tissue ablated, on the patch (mm^2)."""
+    """Area of healthy tissue ablated, on the patch (mm^2), which ends `dose_patch.MARGIN_MM` beyond
+    the ring."""
     healthy_j: torch.Tensor
     """Energy that went into healthy tissue, on the patch and beyond it (J)."""
     lesion_mm2: torch.Tensor

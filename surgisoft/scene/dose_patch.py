@@ -32,6 +32,11 @@ MOST_SAMPLES = 400_000
 """A patch that needs more samples than this is an error."""
 
 
+MARGIN_MM = 4.0
+"""How far a patch reaches beyond the ring, the path, or the margin that is spared (mm). Tissue that
+is ablated farther out is no part of any area."""
+
+
 @dataclass(frozen=True, eq=False)
 class DosePatch:
     """P sample triangles around a ring of N stations; frame of the mesh it was cut from.
@@ -86,7 +91,7 @@ def cut_patch(
     centre_mm: np.ndarray,
     spacing_mm: float,
     band_mm: float = 2.0,
-    margin_mm: float = 4.0,
+    margin_mm: float = MARGIN_MM,
     station_mm: float = 0.5,
 ) -> DosePatch:
     """The patch of a closed ring (M, 3) mm with outward normals (M, 3) about centre_mm (3,).
@@ -104,7 +109,7 @@ def cut_patches(
     rings: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
     spacing_mm: float,
     band_mm: float = 2.0,
-    margin_mm: float = 4.0,
+    margin_mm: float = MARGIN_MM,
     station_mm: float = 0.5,
 ) -> tuple[DosePatch, ...]:
     """One patch for each ring (points, normals, centre); all patches share the same samples.
@@ -158,7 +163,7 @@ def path_patch(
     paths: Sequence[SurfacePath],
     spacing_mm: float,
     band_mm: float = 2.0,
-    margin_mm: float = 4.0,
+    margin_mm: float = MARGIN_MM,
     station_mm: float = 0.5,
 ) -> DosePatch:
     """The patch of paths that are all to be treated in one episode.
@@ -183,7 +188,7 @@ def area_patch(
     outlines: Sequence[SurfacePath],
     spacing_mm: float,
     spared_mm: float,
-    margin_mm: float = 4.0,
+    margin_mm: float = MARGIN_MM,
     station_mm: float = 0.5,
 ) -> DosePatch:
     """The patch of closed outlines whose insides are to be treated.

@@ -376,7 +376,10 @@ class LaserTask(ABC, Generic[Progress]):
         return {name: arm.low.new_zeros(1, arm.chambers) for name, arm in self.world.arms.items()}
 
     def ring_measures(self, state: TaskState[Progress]) -> dict[str, Tensor]:
-        """Measures of a cut around a ring: share cut, largest gap, healthy tissue burnt."""
+        """Measures of a cut around a ring: share cut, largest gap, healthy tissue burnt.
+
+        healthy_mm2 counts tissue up to `dose_patch.MARGIN_MM` from the ring, and none farther out.
+        """
         ring = self.report(state)
         return {
             "completion": ring.completion,

@@ -38,13 +38,13 @@ from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.meshio import write_ply
 from surgisoft.scene.spec import FILE, LesionSpec, MountSpec, save_spec
 from surgisoft.surrogate.arm import ArmSpec
-from surgisoft.surrogate.checkpoint import save_model
+from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import ConstantCurvature
 from surgisoft.tasks.world.arm import Pneumatics, Randomisation
 from surgisoft.tasks.world.authoring import make_scene
 from surgisoft.tasks.world.random_streams import streams
-from surgisoft.tasks.world.reach import reaches_of
+from surgisoft.tasks.world.reach import blank_mounts, reaches_of
 from surgisoft.tasks.world.world import WorldConfig, scene_world, single_arm_world
 from tests.scene.shapes import ball, box, lumpy
 
@@ -596,6 +596,32 @@ def test_mounts_are_found_for_an_arm_of_another_length(tmp_path, monkeypatch, ca
     # the long arm in place of the scene's own would begin inside the organ
     with pytest.raises(InputError, match=r"is 120 mm long, and the scene .* 70 mm as the endosco"):
         scene_world(scene, arm=tmp_path / "long")
+
+
+def test_a_callable_arm_becomes_a_scenes_arm_as_a_folder(tmp_path, monkeypatch, capsys):
+    """The line says how to save it; mounts are then those of the saved model."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "straight.py").write_text(
+        "import numpy as np\n"
+        "class Arm:\n"
+        "    static, error_mm = True, 1.0\n"
+        "    low, high = (0.0, 0.0), (50.0, 50.0)\n"
+        "    length_mm, diameter_mm = 42.0, 9.0\n"
+        "    def __call__(self, time_s, actuation):\n"
+        "        line = np.linspace(0.0, 42.0, 4)[None, :, None] * np.array([0.0, 0.0, 1.0])\n"
+        "        return np.tile(line, (len(actuation), 1, 1))\n"
+        "arm = Arm()\n"
+    )
+    write_ply(ball(60.0, 2), tmp_path / "ball.ply")
+    assert new("scene", "ball.ply", "--arm", "straight.py:arm") == 2
+    said = capsys.readouterr().err
+    assert said.startswith("surgisoft: error: straight.py:arm: is a Python callable, expected 'de")
+    (call,) = re.findall(r"save_model\(.*?\), 'my_arm'\)", said)
+    exec(call, {"save_model": save_model, "load_model": load_model})
+    mount = blank_mounts(models={"laser": "my_arm"})["laser"]
+    assert (mount.length_mm, mount.diameter_mm) == (42.0, 9.0)
+    assert mount.arm == str(tmp_path / "my_arm")
+    assert not (tmp_path / "scene").exists()
 
 
 def test_an_existing_folder_is_kept(made, tmp_path, capsys):

@@ -15,6 +15,7 @@ from surgisoft.scene.mounted_arm import MountedArm, solve_ring
 from surgisoft.scene.reach import ArmReach
 from surgisoft.scene.spec import FILE, TOOLS, MountSpec, arm_names, arm_rank
 from surgisoft.surrogate.arm import ArmSpec
+from surgisoft.surrogate.callables.named import is_callable_name
 from surgisoft.surrogate.checkpoint import default_arm, load_model
 from surgisoft.surrogate.reach import grid_axes, model_table
 
@@ -53,7 +54,7 @@ def blank_mounts(
     tools: the tool of each arm; where several arms carry one they are `laser_1`, `laser_2`, ...
     models: the arm model, `default` or a fitted model's folder, of an arm by its name, or of all
     arms with a tool by the tool; an arm that is left out has the default one. Raises InputError
-    where a folder holds no model, or one without a length.
+    where a folder holds no model, or one without a length, and for the name of a callable.
     """
     if not tools:
         raise InputError(f"no arm is given; expected at least one of {', '.join(TOOLS)}")
@@ -70,6 +71,13 @@ def blank_mounts(
         mount = named[name]
         mount = mount if name == mount.tool else replace(mount, name=name)
         model = models.get(name, models.get(mount.tool, "default"))
+        if is_callable_name(str(model)):
+            raise InputError(
+                f"{model}: is a Python callable, expected 'default' or an arm model's folder, "
+                "because opening a scene runs no code; save it in Python by "
+                f"save_model(load_model('{model}'), 'my_arm') of surgisoft.surrogate.checkpoint, "
+                f"and give --arm my_arm --model-code {model}"
+            )
         if model != "default":
             spec = load_model(model).spec
             if spec.length_mm is None:

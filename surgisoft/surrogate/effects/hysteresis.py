@@ -277,7 +277,7 @@ def _further(facts: ArmFacts, points: Tensor) -> list[Effect]:
     if m == 1:
         return [Hysteresis(facts, FEW_RADII, True, False)]
     shares = OTHERS[::2] if m in RINGS else OTHERS
-    alike = [Hysteresis(facts, FEW_RADII, True, False, others) for others in shares]
+    alike: list[Effect] = [Hysteresis(facts, FEW_RADII, True, False, others) for others in shares]
     if m in RINGS:
         alike.append(Hysteresis(facts, FEW_RADII, True, True, SECTION[m], True))
     if m == 3:

@@ -35,7 +35,7 @@ from surgisoft.measurement.recordings import load_recordings
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
 from surgisoft.surrogate.effects import named_effects
-from surgisoft.surrogate.fitted_rows import FittedRows, Use
+from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.workers import torch_threads
 
@@ -417,8 +417,8 @@ def amend(
         state_residuals(better, model, retuned)
         if alone.claimed:
             state_error(better, model, whole)
-    use: Use = "fitted" if retuned or judged is not None else "amended"
-    better.fitted_rows = FittedRows.of([plain.history], use).joined(model.fitted_rows)
+    own = FittedRows.of_amending(plain.history, trained=retuned or judged is not None)
+    better.fitted_rows = own.joined(model.fitted_rows)
     found = Estimates(list(parameters), words)
     parameters, words = beside_former(found, model, problem.covered_s)
     is_paired = both is not None and both.used

@@ -44,7 +44,7 @@ from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
 from surgisoft.surrogate.effects.user_defined import kind_of
-from surgisoft.surrogate.fitted_rows import FittedRows, Use
+from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.workers import torch_threads
@@ -456,8 +456,8 @@ def improve(
         of_fit = made[-1].fitted
         state_residuals(final_model, of_fit, retuned)
         trained = retuned or any(done.together for done in rounds)
-        use: Use = "fitted" if trained else "amended"
-        final_model.fitted_rows = FittedRows.of([table.history], use).joined(model.fitted_rows)
+        own = FittedRows.of_amending(table.history, trained)
+        final_model.fitted_rows = own.joined(model.fitted_rows)
     sealed.check(table)
     opened = sealed.opened(table)
     held_out = whole = opened.final_check()

@@ -99,10 +99,10 @@ def refuse_amended(
     """
     recordings = list(recordings)
     for recording, seen in zip(recordings, seen_in_fit(model, recordings), strict=True):
-        if "amended" in seen.shares:
+        if seen.effects_in_words:
             names = " + ".join(each.name for each in before)
             raise InputError(
-                f"{recording.label}: {seen.words}, expected a model from before the change: "
+                f"{recording.label}: {seen.effects_in_words}, expected a model from before the change: "
                 f"compared with {names}, what these effects explain would be found again; leave "
                 "out --before, or run 'surgisoft improve' on the model as it was before these "
                 "effects were added"

@@ -29,6 +29,8 @@ IN_WORDS: dict[Use, str] = {
     "amended": "effects of the model were fitted to {} of its rows",
 }
 """What a model has seen of a recording; {}: share of its rows."""
+TUNED_IN_WORDS = "effects and the network of the model were fitted to {} of its rows"
+"""The same of rows that trained the network further when effects were fitted to them."""
 SIZE = 512
 """Most hashes of a sketch. Of 10,000 fitted rows 5 % of the hashes are in it, so that 3,000 other
 rows are judged by some 150 of them."""
@@ -42,6 +44,9 @@ class Seen:
 
     shares: dict[Use, float]
     """Share 0..1 of the rows in each use that counts; empty where the model has seen none."""
+    tuned: float = 0.0
+    """Share 0..1 of the rows that trained the network further when effects were fitted to them;
+    0 where it is less than `LEAST_KNOWN`. They are among the fitted ones."""
 
     def __bool__(self) -> bool:
         return bool(self.shares)
@@ -50,6 +55,13 @@ class Seen:
     def effects_alone(self) -> bool:
         """Whether nothing but effects was fitted to rows that the model has seen."""
         return set(self.shares) == {"amended"}
+
+    @property
+    def effects_in_words(self) -> str:
+        """What was fitted to the rows that effects were added for; empty where there are none."""
+        found = [(IN_WORDS["amended"], self.shares.get("amended", 0.0))]
+        found.append((TUNED_IN_WORDS, self.tuned))
+        return " and ".join(text.format(f"{100 * share:.0f} %") for text, share in found if share)
 
     @property
     def words(self) -> str:
@@ -73,13 +85,30 @@ class FittedRows:
     """Those of the hashes whose rows only chose the model."""
     amended: frozenset[int] = frozenset()
     """Those of the hashes to whose rows only effects were fitted, in a model that was amended."""
+    tuned: frozenset[int] = frozenset()
+    """Those of the hashes whose rows trained the network further when effects were fitted to them,
+    in a model that was amended."""
 
     @classmethod
-    def of(cls, histories: Iterable[History], use: Use = "fitted") -> FittedRows:
-        """The sketch of all rows of histories with a measured key point, used for one thing."""
+    def of(
+        cls, histories: Iterable[History], use: Use = "fitted", tuned: bool = False
+    ) -> FittedRows:
+        """The sketch of all rows of histories with a measured key point, used for one thing.
+
+        tuned: whether effects were fitted to these rows, too, which trained the network further.
+        """
         found = np.concatenate([row_hashes(history) for history in histories])
         hashes = tuple(np.unique(found)[:SIZE].tolist())
-        return cls(len(found), hashes).used(use)
+        known = cls(len(found), hashes).used(use)
+        return replace(known, tuned=frozenset(hashes)) if tuned else known
+
+    @classmethod
+    def of_amending(cls, history: History, trained: bool) -> FittedRows:
+        """The sketch of the rows of a history that effects were fitted to.
+
+        trained: whether they trained the network, too.
+        """
+        return cls.of([history], "fitted" if trained else "amended", tuned=trained)
 
     def used(self, use: Use) -> FittedRows:
         """The same rows, all in one use."""
@@ -88,6 +117,7 @@ class FittedRows:
             self,
             chosen=every if use == "chosen" else none,
             amended=every if use == "amended" else none,
+            tuned=none,
         )
 
     def joined(self, other: FittedRows | None) -> FittedRows:
@@ -106,6 +136,7 @@ class FittedRows:
             both,
             chosen.intersection(whole),
             amended.intersection(whole),
+            (self.tuned | other.tuned).intersection(whole),
         )
 
     @property
@@ -123,29 +154,37 @@ class FittedRows:
         about. parts: (N,) labels of parts that are estimated apart and weighed by their rows, which
         is exact where the model was fitted to all or none of a part, as by `amend`.
         """
-        if parts is None:
-            return self._uses(np.unique(row_hashes(history, rows)))
-        chosen = np.ones(len(parts), bool) if rows is None else rows
-        asked = [chosen & (parts == part) for part in np.unique(parts)]
-        hashes = [np.unique(row_hashes(history, some)) for some in asked]
-        total = max(sum(map(len, hashes)), 1)
-        answer: dict[Use, float] = {"fitted": 0.0, "chosen": 0.0, "amended": 0.0}
-        for some in hashes:
-            for use, share in self._uses(some).items():
-                answer[use] += share * len(some) / total
-        return answer
-
-    def _uses(self, found: np.ndarray) -> dict[Use, float]:
-        """Estimated share of distinct rows in each use, from their hashes (K,)."""
-        if len(self.hashes) == SIZE:
-            found = found[found <= self.hashes[-1]]
-        kinds: dict[Use, frozenset[int]] = {
+        known: dict[Use, frozenset[int]] = {
             "fitted": self._fitted,
             "chosen": self.chosen,
             "amended": self.amended,
         }
-        asked, count = set(found.tolist()), max(len(found), 1)
-        return {use: len(asked & known) / count for use, known in kinds.items()}
+        shares = self._shares(list(known.values()), history, rows, parts)
+        return dict(zip(known, shares, strict=True))
+
+    def _shares(
+        self,
+        known: list[frozenset[int]],
+        history: History,
+        rows: np.ndarray | None,
+        parts: np.ndarray | None,
+    ) -> list[float]:
+        """Estimated share of a history's rows whose hash is in each of some sets; rows, parts: as
+        for `uses_of`."""
+        if parts is None:
+            hashes = [np.unique(row_hashes(history, rows))]
+        else:
+            asked = np.ones(len(parts), bool) if rows is None else rows
+            labels = np.unique(parts)
+            hashes = [np.unique(row_hashes(history, asked & (parts == part))) for part in labels]
+        total = max(sum(map(len, hashes)), 1)
+        shares = [0.0] * len(known)
+        for found in hashes:
+            judged = found[found <= self.hashes[-1]] if len(self.hashes) == SIZE else found
+            own, count = set(judged.tolist()), max(len(judged), 1)
+            for place, some in enumerate(known):
+                shares[place] += len(own & some) / count * len(found) / total
+        return shares
 
     def share_of(
         self, history: History, rows: np.ndarray | None = None, parts: np.ndarray | None = None
@@ -172,28 +211,35 @@ class FittedRows:
         if sum(shares.values()) < LEAST_KNOWN:
             return Seen({})
         least = min(LEAST_KNOWN, max(shares.values()))
-        return Seen({use: shares[use] for use in IN_WORDS if shares[use] >= least})
+        (tuned,) = self._shares([self.tuned], history, None, parts)
+        return Seen(
+            {use: shares[use] for use in IN_WORDS if shares[use] >= least},
+            tuned if tuned >= LEAST_KNOWN else 0.0,
+        )
 
     def to_json(self) -> dict:
         """Plain values for a model's `config.json`."""
-        return {
+        values = {
             "rows": self.count,
             "complete": self.complete,
             "hashes": [f"{value:016x}" for value in self.hashes],
             "chosen": [f"{value:016x}" for value in sorted(self.chosen)],
             "amended": [f"{value:016x}" for value in sorted(self.amended)],
         }
+        if self.tuned:
+            values["tuned"] = [f"{value:016x}" for value in sorted(self.tuned)]
+        return values
 
     @classmethod
     def from_json(cls, values: dict) -> FittedRows:
         """The sketch of a model's `config.json`."""
-        hashes, chosen, amended = (
+        hashes, *uses = (
             [int(text, 16) for text in values.get(kind, ())]
-            for kind in ("hashes", "chosen", "amended")
+            for kind in ("hashes", "chosen", "amended", "tuned")
         )
         complete = bool(values.get("complete", True))
         rows = int(values["rows"])
-        return cls(rows, tuple(hashes), complete, frozenset(chosen), frozenset(amended))
+        return cls(rows, tuple(hashes), complete, *map(frozenset, uses))
 
 
 def row_hashes(history: History, rows: np.ndarray | None = None) -> np.ndarray:

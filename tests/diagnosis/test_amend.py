@@ -14,6 +14,7 @@ import torch
 from surgisoft.cli import run
 from surgisoft.diagnosis.amend import Amendment, Fall, amend, fall_of, track_of
 from surgisoft.diagnosis.compare import compare
+from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.diagnosis.estimation.network import Retuned, best_layer, retune
 from surgisoft.diagnosis.residuals import held_out_rows, problem_of, residual_table
 from surgisoft.errors import InputError
@@ -268,6 +269,9 @@ def test_a_network_is_retuned_behind_an_effect_that_is_there_and_earns_it_no_cla
         share = found.model.fitted_rows.uses_of(history_of([with_creep]))
         assert share[use] > 0.6
         assert share[other] == 0.0
+        before = measured_on(bare_arm(), rows=250, noise_seed=1)
+        with pytest.raises(InputError, match=r"fitted to 7\d % of its rows.*would be found again"):
+            diagnose(found.model, [with_creep], before=[before], setup_tests=False)
     assert both.alone == kept.held_out
     assert both.held_out.after < 0.7 * kept.held_out.after
     assert both.held_out.after < 1.5 * both.held_out.floor

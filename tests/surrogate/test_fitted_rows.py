@@ -84,6 +84,23 @@ def test_rows_with_several_uses_count_once(pair):
         assert both.uses_of(other) == {"fitted": 0.0, "chosen": 1.0, "amended": 0.0}
 
 
+def test_rows_that_effects_and_network_were_fitted_to_are_kept_as_both(pair):
+    """They count as fitted, and the effects are known after a save and beside the first fit."""
+    first, other = (history_of([each]) for each in pair)
+    trained = FittedRows.of([first])
+    for own, words in (
+        (FittedRows.of_amending(other, trained=True), "effects and the network of the model were"),
+        (FittedRows.of_amending(other, trained=False), "effects of the model were"),
+    ):
+        for both in (trained.joined(own), own.joined(trained)):
+            again = FittedRows.from_json(both.to_json())
+            assert again == both
+            assert again.seen_of(other).effects_in_words == f"{words} fitted to 100 % of its rows"
+            assert again.seen_of(first).effects_in_words == ""
+    assert FittedRows.of_amending(other, trained=True).uses_of(other)["fitted"] == 1.0
+    assert "tuned" not in trained.to_json()
+
+
 def test_a_record_without_the_rows_of_the_first_fit_stays_incomplete(pair):
     first, other = (history_of([each]) for each in pair)
     part, whole = FittedRows.of([first]).joined(None), FittedRows.of([first])

@@ -269,6 +269,24 @@ def test_lost_key_points_are_no_jump():
     assert find_warnings(dataclasses.replace(clean, key_points_mm=points)) == []
 
 
+def test_a_move_across_dropped_frames_is_no_jump():
+    """The tip alone goes on at 2 mm a frame, while 8 frames are not in the log at all; a step of as
+    many mm within the usual time is a jump still."""
+    rng = np.random.default_rng(0)
+    frame = np.delete(np.arange(600), slice(301, 309))
+    x = 60 * np.abs((frame / 30 - 0.3) % 2 - 1)
+    points = np.zeros((len(frame), 3, 3)) + np.array([[0, 0, 20.0], [0, 0, 45.0], [0, 0, 70.0]])
+    points += rng.normal(0, 0.05, points.shape)
+    points[:, 2, 0] += x
+    actuation = np.repeat(frame[:, None] / 10, 2, axis=1)
+    gap = Recording("x", frame / RATE_HZ, actuation, points)
+    assert abs(x[301] - x[300]) == pytest.approx(18)
+    assert key_point_jumps(gap) == {}
+    even = dataclasses.replace(gap, t_s=np.arange(len(frame)) / RATE_HZ)
+    ((row, size),) = key_point_jumps(even)[2]
+    assert (row, round(size)) == (301, 18)
+
+
 @pytest.mark.parametrize("samples", [1, 2, 3, 5])
 def test_few_samples_are_no_trouble(samples):
     t = np.arange(samples) * 1.0

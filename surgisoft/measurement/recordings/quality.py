@@ -323,7 +323,8 @@ class _Track:
     rows: np.ndarray
     """(F,) sample index of each fresh position."""
     steps_mm: np.ndarray
-    """(F - 1,) length of the step to each fresh position from the one before, per row [mm]."""
+    """(F - 1,) length of the step to each fresh position from the one before, per row, or per usual
+    time between rows where rows are lacking [mm]."""
 
     def ratios(self, at: np.ndarray) -> np.ndarray:
         """Steps `at` (C,) against the usual steps before and after each, whichever is the larger.
@@ -373,13 +374,20 @@ class _Track:
         return ratios.max(axis=1, initial=0.0)
 
 
-def _track(points: np.ndarray, start: int) -> _Track:
-    """The track of positions (R, 3) [mm] of a run that begins at sample `start`."""
+def _track(points: np.ndarray, t_s: np.ndarray, start: int) -> _Track:
+    """The track of positions (R, 3) [mm] at times (R,) [s] of a run that begins at sample `start`.
+
+    A step over frames that a camera dropped takes as long as several, whether the log has rows for
+    them or not.
+    """
     known = np.flatnonzero(~np.isnan(points[:, 0]))  # missing ones are missing as a whole
     fresh = known[_changes(points[known], np.zeros(len(known)))] if len(known) else known
     moved = np.diff(points[fresh], axis=0)
     steps = np.sqrt(np.einsum("ri,ri->r", moved, moved))
-    return _Track(fresh + start, steps / np.diff(fresh) if len(fresh) > 1 else steps)
+    if len(fresh) < 2:
+        return _Track(fresh + start, steps)
+    usual_s = max(float(np.median(np.diff(t_s))), 1e-12)
+    return _Track(fresh + start, steps / np.maximum(np.diff(fresh), np.diff(t_s[fresh]) / usual_s))
 
 
 def _motion_mm(points: np.ndarray) -> np.ndarray:
@@ -399,7 +407,8 @@ def key_point_jumps(recording: Recording) -> dict[int, list[tuple[int, float]]]:
     motion_mm = motions_mm.max()
     hits: dict[int, list[tuple[int, float]]] = {}
     for run in recording.runs:
-        tracks = [_track(points[run, j], run.start) for j in range(recording.key_points)]
+        t_s = recording.t_s[run]
+        tracks = [_track(points[run, j], t_s, run.start) for j in range(recording.key_points)]
         for j, track in enumerate(tracks):
             others = [
                 (other, motions_mm[i] / max(motions_mm[j], 1e-12))

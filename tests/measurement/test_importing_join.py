@@ -291,6 +291,45 @@ def test_the_clock_of_a_second_file_is_shifted_or_begins_with_the_first(
     np.testing.assert_allclose(part.recording.key_points_mm[:, 0, 0], t)
 
 
+@pytest.mark.parametrize(
+    ("log_from_to", "clock", "said"),
+    [
+        (
+            (5000.0, 13000.0),
+            "",
+            r"from 5000 to 13000 s, about 1000 times as long: if the times of .*inp.csv are in ms, "
+            r'set time_unit = "ms" in \[file.inputs\] of the map$',
+        ),
+        (
+            (5.0, 13.0),
+            'time_unit = "ms"',
+            r"from 0.005 to 0.013 s, about 1/1000 times as long: if the times of .*inp.csv are in "
+            r's, set time_unit = "s" in .*; if those of .*pos.csv are in ms, set unit = "ms" in ',
+        ),
+        ((0.0, 9.0e9), "", r'about 1e.09 times as long: .* time_unit = "ns" in'),
+        (
+            (500.0, 509.0),
+            "",
+            r"from 500 to 509 s: if their clocks count from different moments, set clock = "
+            r'"from_start" or clock_offset_s in \[file.inputs\]',
+        ),
+    ],
+)
+def test_files_without_a_common_time_say_both_ranges_and_the_unit(
+    tmp_path, log_from_to, clock, said
+):
+    """The positions are from 2 to 11 s."""
+    s = np.linspace(*log_from_to, 90)
+    t = np.linspace(2.01, 11.0, 40)
+    files = [
+        written(tmp_path / "inp.csv", text(np.stack([s, s], axis=1), header=["s", "u"])),
+        written(tmp_path / "pos.csv", text(np.stack([t] * 4, axis=1), header=["t", "x", "y", "z"])),
+    ]
+    expected = "no row is left after joining .*; .*pos.csv has times from 2.01 to 11 s, .*inp.csv "
+    with pytest.raises(InputError, match=expected + f".*{said}"):
+        run(tmp_path, files, BY_TIME.replace("CLOCK", clock).replace("SCALE", ""))
+
+
 # --- rows and runs of one file -----------------------------------------------------------------
 
 

@@ -1,5 +1,6 @@
 """The actuation's clock: values between rows, logs that are late, readings that were held."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -16,6 +17,10 @@ SAME_TIME_S = 1e-6
 """Times that differ by no more are the same [s]."""
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 """Date from which times of dates count; a date without an offset is taken for UTC."""
+UNIT_RATIOS = (1e3, 1e6, 1e9, 1e-3, 1e-6, 1e-9)
+"""How many times as long one log seems as another where s, ms, us and ns are confused."""
+SAME_LENGTH = 2.0
+"""Largest ratio of the lengths of two logs of one experiment."""
 LARGEST_GAP_S = 1.0
 """Longest gap of a late log within which it is still read [s]."""
 
@@ -159,10 +164,12 @@ def join(
             keep &= inside
             _note_time_join(role, table, main, inside, notes)
     if not keep.any():
-        why = "".join(f"; {note}" for note in notes)
+        by_time = [name for name, role in others.items() if role.join == "time"]
+        why = notes if len(by_time) < len(others) else []
+        why = [*why, *(_apart(spec, name, tables[name], main, t_s) for name in by_time)]
         raise InputError(
             f"{main.path}: no row is left after joining the files, expected common rows or times"
-            + why
+            + "".join(f"; {text}" for text in why)
         )
     first, last = spec.rows.first, spec.rows.last or len(rows)
     keep &= (rows + 1 >= first) & (rows + 1 <= last)
@@ -223,6 +230,18 @@ def _by_time(
     A held column keeps the value of the row before (or at) each time; a quaternion turns at a
     constant rate, and the others are linear between the two rows around it.
     """
+    log_s, t_s = _clocks(role, table, t_s)
+    at = Between.of(log_s, t_s)
+    use_held = np.array(held) | (role.interpolate == "previous")
+    found = at.linear(values)
+    for turn in turns:
+        found[:, turn] = between(values[at.before][:, turn], values[at.after][:, turn], at.share)
+    found = np.where(use_held, at.held(values), found)
+    return found, at.inside & (at.gap_s <= role.max_gap_s)
+
+
+def _clocks(role: FileRole, table: RawTable, t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Times of a log's rows (R,) and of the main file's (T,) on one clock [s]."""
     log_s = times(table, role.time, role.time_unit)
     back = np.flatnonzero(~(np.diff(log_s) > 0))
     if len(back):
@@ -233,14 +252,46 @@ def _by_time(
         )
     if role.clock == "from_start":
         log_s, t_s = log_s - log_s[0], t_s - t_s[0]
-    log_s = log_s + role.clock_offset_s
-    at = Between.of(log_s, t_s)
-    use_held = np.array(held) | (role.interpolate == "previous")
-    found = at.linear(values)
-    for turn in turns:
-        found[:, turn] = between(values[at.before][:, turn], values[at.after][:, turn], at.share)
-    found = np.where(use_held, at.held(values), found)
-    return found, at.inside & (at.gap_s <= role.max_gap_s)
+    return log_s + role.clock_offset_s, t_s
+
+
+def _apart(spec: ImportMap, name: str, table: RawTable, main: RawTable, t_s: np.ndarray) -> str:
+    """Why no row of the main file, at times t_s (T,) [s], has one of a log: both ranges of times,
+    and what to change in the map."""
+    role = spec.file[name]
+    log_s, t_s = _clocks(role, table, t_s)
+    text = (
+        f"{main.path} has times from {t_s[0]:.6g} to {t_s[-1]:.6g} s, {table.path} from "
+        f"{log_s[0]:.6g} to {log_s[-1]:.6g} s"
+    )
+    longer = max(np.ptp(log_s), 1e-300) / max(np.ptp(t_s), 1e-300)
+    ratio = next((by for by in UNIT_RATIOS if 1 / SAME_LENGTH <= longer / by <= SAME_LENGTH), None)
+    if ratio is None:
+        return (
+            f'{text}: if their clocks count from different moments, set clock = "from_start" or '
+            f"clock_offset_s in [file.{name}] of the map"
+        )
+    advice = []
+    if unit := _unit_of(role.time_unit, 1 / ratio):
+        advice.append(
+            f'if the times of {table.path} are in {unit}, set time_unit = "{unit}" in '
+            f"[file.{name}] of the map"
+        )
+    plain = spec.time.column is not None and spec.time.rate_hz is None
+    if plain and (unit := _unit_of(spec.time.unit, ratio)):
+        advice.append(
+            f'if those of {main.path} are in {unit}, set unit = "{unit}" in [time] of the map'
+        )
+    if not advice:
+        advice.append(f"check [time] and time_unit in [file.{name}] of the map")
+    times_as_long = f"{ratio:g}" if ratio > 1 else f"1/{1 / ratio:g}"
+    return f"{text}, about {times_as_long} times as long: {'; '.join(advice)}"
+
+
+def _unit_of(unit: str, by: float) -> str | None:
+    """The unit of time that is `by` times as long as another one; None where none is."""
+    size = SECONDS_PER.get(unit, 0.0) * by
+    return next((name for name, own in SECONDS_PER.items() if math.isclose(own, size)), None)
 
 
 def _note_time_join(

@@ -144,6 +144,7 @@ def test_the_number_in_the_note_puts_the_log_right(tmp_path):
     table[:, 5:] = np.stack([now[:, 0], now[:, 1], 70 - 0.01 * now[:, 0] ** 2], axis=1) + noise / 20
     _, notes = imported(tmp_path, table)
     (note,) = [note for note in notes if "delay_s" in note]
+    assert note.endswith("in [measured] and [commanded] of the map"), "columns of one file"
     value = float(note.split("delay_s = ")[1].split()[0])
     assert value == pytest.approx(0.04, abs=0.002)
     _, notes = imported(tmp_path, table, "delay_s = 0.02")

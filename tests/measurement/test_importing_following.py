@@ -58,7 +58,7 @@ FOLLOWS = {
 @pytest.mark.parametrize("name", FOLLOWS)
 def test_an_arm_that_follows_in_any_way_is_not_told(name):
     given = recorded(FOLLOWS[name])
-    assert following_warnings(given, 0.0) == []
+    assert following_warnings(given, {"measured": 0.0}) == []
     assert following(given).explained > 0.5
 
 
@@ -67,7 +67,7 @@ def test_the_log_of_another_recording_is_told(seed):
     """The actuation of another seed has nothing to do with the body."""
     given = recorded(lambda p: lagged(p, 0.3), seed)
     mixed = replace(given, measured=recorded(seed=seed + 100).measured)
-    (warning,) = following_warnings(mixed, 0.0)
+    (warning,) = following_warnings(mixed, {"measured": 0.0})
     assert "the key points do not follow the actuation" in warning
     assert "check that the files are of the same recording" in warning
 
@@ -79,11 +79,11 @@ def test_clocks_far_apart_are_no_other_recording(offset_s):
     late, rest = slice(rows, None), slice(None, -rows)
     body, log = (rest, late) if offset_s > 0 else (late, rest)
     apart = Recording("arm", given.t_s[rest], given.measured[log], given.key_points_mm[body])
-    (warning,) = following_warnings(apart, 0.0)
+    (warning,) = following_warnings(apart, {"measured": 0.0})
     assert f"{abs(offset_s):.3g} s {'late' if offset_s > 0 else 'early'}" in warning
     assert f"set delay_s = {-offset_s:.3g} in [measured]" in warning
     corrected = replace(apart, measured=given.measured[body])
-    assert following_warnings(corrected, 0.0) == []
+    assert following_warnings(corrected, {"measured": 0.0}) == []
 
 
 def test_what_a_recording_cannot_show_is_not_told():

@@ -514,6 +514,10 @@ def _finished(part: Imported, spec: ImportMap) -> Imported:
     notes = [*notes, *plausibility_notes(recording, spec.key_points.unit, time_unit)]
     if spec.runs.gap_s is None and (found := gaps_in_words(recording)):
         notes = [*notes, found]
-    notes = [*notes, *timing_notes(recording, spec.measured.delay_s)]
-    warnings = tuple(following_warnings(recording, spec.measured.delay_s))
+    delays_s = {"measured": spec.measured.delay_s}
+    command = spec.commanded
+    if command and recording.commanded is not None and command.file == spec.measured.file:
+        delays_s["commanded"] = command.delay_s
+    notes = [*notes, *timing_notes(recording, delays_s)]
+    warnings = tuple(following_warnings(recording, delays_s))
     return replace(part, recording=recording, notes=notes, warnings=warnings)

@@ -7,11 +7,12 @@ of up to minutes. The best one says what share of the body's motion the actuatio
 all on an arm, whatever its lag and its hysteresis, and nothing where files were mixed up.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from surgisoft.measurement.importing.timing import BLOCKS, FOLDS, RIDGE, Moves
+from surgisoft.measurement.importing.timing import BLOCKS, FOLDS, RIDGE, Moves, set_delay
 from surgisoft.measurement.recordings import Recording
 
 EXPLAINED = 0.3
@@ -67,10 +68,10 @@ def following(recording: Recording) -> Following | None:
     return Following(explained, shifted, late)
 
 
-def following_warnings(recording: Recording, delay_s: float) -> list[str]:
+def following_warnings(recording: Recording, delays_s: Mapping[str, float]) -> list[str]:
     """A warning where the key points do not follow the actuation, or only at another time.
 
-    delay_s: delay of the actuation's log that the map already corrects [s].
+    delays_s: as for `set_delay`.
     """
     found = following(recording)
     if found is None or found.explained > EXPLAINED:
@@ -80,8 +81,7 @@ def following_warnings(recording: Recording, delay_s: float) -> list[str]:
         return [
             f"the key points follow the actuation {abs(found.shift_s):.3g} s {how} "
             f"({found.shifted:.0%} of their motion is explained then, and none as the times are): "
-            "if the clocks of the files are apart, set "
-            f"delay_s = {delay_s - found.shift_s:.3g} in [measured] of the map"
+            f"if the clocks of the files are apart, {set_delay(delays_s, -found.shift_s, '.3g')}"
         ]
     if found.shifted > EXPLAINED:
         return []

@@ -1,5 +1,6 @@
 """Moves of the body regressed on moves of the actuation, at shifts in time between the two."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -326,10 +327,22 @@ def body_lead(recording: Recording) -> Lead | None:
     return Lead(-seconds * step, (-(seconds + 2 * spread) * step, -(seconds - 2 * spread) * step))
 
 
-def timing_notes(recording: Recording, delay_s: float) -> list[str]:
+def set_delay(delays_s: Mapping[str, float], more_s: float, digits: str = ".3f") -> str:
+    """What to put into a map where logs of actuation are later than it says, by `more_s` [s].
+
+    delays_s: delay that the map already corrects, by its tables that are of the same clock [s].
+    """
+    by_value: dict[str, list[str]] = {}
+    for table, delay_s in delays_s.items():
+        by_value.setdefault(format(delay_s + more_s, digits), []).append(f"[{table}]")
+    parts = [f"delay_s = {value} in {' and '.join(names)}" for value, names in by_value.items()]
+    return f"set {' and '.join(parts)} of the map"
+
+
+def timing_notes(recording: Recording, delays_s: Mapping[str, float]) -> list[str]:
     """Notes about a delay of the actuation's clock, with what to put into the import's map.
 
-    delay_s: delay of the actuation's log that the map already corrects [s].
+    delays_s: as for `set_delay`.
     """
     notes = []
     period = held_period_s(recording)
@@ -345,8 +358,8 @@ def timing_notes(recording: Recording, delay_s: float) -> list[str]:
         low, high = lead.ci95_s
         notes.append(
             f"the body moves {lead.seconds:.3f} s ({low:.3f} to {high:.3f}) before its measured "
-            "actuation, which no arm that follows it can: if the actuation was logged late, set "
-            f"delay_s = {delay_s + lead.seconds:.3f} in [measured] of the map"
+            "actuation, which no arm that follows it can: if the actuation was logged late, "
+            f"{set_delay(delays_s, lead.seconds)}"
         )
     return notes
 

@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 
+from surgisoft.measurement.importing.align import renewal_s
 from surgisoft.measurement.recordings import Recording
 from surgisoft.measurement.recordings.clock import (
     USUAL_S,
@@ -13,7 +14,7 @@ from surgisoft.measurement.recordings.clock import (
     usual_step_s,
 )
 from surgisoft.measurement.recordings.columns import MM_PER
-from surgisoft.measurement.units import SECONDS_PER
+from surgisoft.measurement.units import SECONDS_PER, unit_mistakes
 
 LARGEST_RATIO = 2.0
 """Key points that span more than this multiple of the arm's length are in a wrong unit."""
@@ -36,6 +37,15 @@ SHIFT_S = 0.05
 taken; the largest one counts, so that a lag or clocks that differ are no wrong order [s]."""
 LARGEST_SHIFT_S = 3.0
 """Largest such delay, either way [s]."""
+LEAST_LEAD_S = 0.1
+"""Least time by which measured actuation is said to precede its command: two of these steps [s]."""
+LEAST_FOLLOWING = 0.95
+"""Least correlation of a measured channel with its own command from which the ratio of the two is
+that of a wrong unit [-]."""
+SPREAD = (0.05, 0.95)
+"""Quantiles between which values lie whose spread is compared [-]."""
+SAME_RATIO = 0.05
+"""Largest difference, as a share, of that ratio from the one of two units, in every channel [-]."""
 MOST_ROWS = 6000
 """Rows, evenly over the recording, whose measured actuation is compared with the commands: they
 determine a correlation of 0.9 to within 0.01 (a count)."""
@@ -44,8 +54,8 @@ determine a correlation of 0.9 to within 0.01 (a count)."""
 def plausibility_notes(
     recording: Recording, unit: str | None, time_unit: str | None = None
 ) -> list[str]:
-    """Contradictions to the arm's stated length, the order base to tip, a moving arm's rows and the
-    order of the commanded channels.
+    """Contradictions to the arm's stated length, the order base to tip, a moving arm's rows, and
+    the order, the clock and the unit of the commanded channels.
 
     unit: of positions; time_unit: of the column of times, None where the map states a rate.
     """
@@ -58,10 +68,22 @@ def plausibility_notes(
 
 
 def _channels(recording: Recording) -> list[str]:
-    """A note where measured channels follow each other's commands and not their own."""
-    if recording.commanded is None or recording.chambers < 2:
+    """Notes where measured channels follow each other's commands and not their own; else where they
+    precede their commands, and where they are a unit's multiple of them."""
+    if recording.commanded is None:
         return []
-    follows = _correlations(recording)
+    shifts, each = _correlations(recording)
+    order = _channel_order(each.max(axis=0))
+    if order:
+        return order
+    own = np.diagonal(each, axis1=1, axis2=2)
+    return [*_lead(recording, shifts, own), *_unit(recording, shifts, own)]
+
+
+def _channel_order(follows: np.ndarray) -> list[str]:
+    """A note where measured channels follow each other's commands, by their correlations (m, m)."""
+    if len(follows) < 2:
+        return []
     own = np.diagonal(follows)
     best = follows.argmax(axis=1)
     highest = follows.max(axis=1)
@@ -83,22 +105,78 @@ def _channels(recording: Recording) -> list[str]:
     ]
 
 
+def _lead(recording: Recording, shifts: np.ndarray, own: np.ndarray) -> list[str]:
+    """A note where measured actuation precedes its command, which nothing that follows it can.
+
+    shifts: (S,) how late the measured values are [s]; own: (S, m) correlation of each channel with
+    its command there. A command that is logged seldom is held, and late by as much.
+    """
+    command = recording.commanded
+    late, early = own[shifts >= 0].max(axis=0), own[shifts < 0]
+    if command is None or not len(early):
+        return []
+    moving = late > 0
+    unexplained = 1 - np.square(early[:, moving])
+    best = shifts[shifts < 0][unexplained.mean(axis=1).argmin()] if moving.any() else 0.0
+    held = renewal_s([(recording.t_s[run], command[run]) for run in recording.runs])
+    if -best < max(LEAST_LEAD_S, 2 * held):
+        return []
+    least = unexplained.mean(axis=1).min()
+    if least > 1 - LEAST_CORRELATION**2:
+        return []
+    if np.mean(1 - np.square(late[moving])) < LEAST_RATIO_UNEXPLAINED * least:
+        return []
+    return [
+        f"measured actuation moves about {-best:.2f} s before its command, which nothing that "
+        "follows a command can: if both are of one log or clock, set the same delay_s in [measured]"
+        " and [commanded] of the map"
+    ]
+
+
+def _unit(recording: Recording, shifts: np.ndarray, own: np.ndarray) -> list[str]:
+    """A note where measured actuation is so many times its command as one unit is of another.
+
+    shifts, own: as for `_lead`.
+    """
+    command = recording.commanded
+    best = own.max(axis=0)
+    moving = best > 0
+    if command is None or not moving.any() or (best[moving] < LEAST_FOLLOWING).any():
+        return []
+    # A measured value is about as large as its command at any lag, so spreads give the ratio.
+    measured, commanded = (
+        np.ptp(np.quantile(values[:, moving], SPREAD, axis=0), axis=0)
+        for values in (recording.measured, command)
+    )
+    ratios = measured / np.maximum(commanded, 1e-300)
+    for units, by in unit_mistakes(recording.unit).items():
+        if any((np.abs(ratios / factor - 1) <= SAME_RATIO).all() for factor in (by, 1 / by)):
+            return [
+                f"measured actuation is {np.median(ratios):.3g} times its command, as if one were "
+                f"in {units[0]} and the other in {units[1]}: check unit and to in [measured] and "
+                "[commanded] of the map"
+            ]
+    return []
+
+
 def _listed(values: np.ndarray, form: str = "d") -> str:
     *first, last = (format(value, form) for value in values.tolist())
     return f"{', '.join(first)} and {last}"
 
 
-def _correlations(recording: Recording) -> np.ndarray:
-    """(m, m) largest correlation of each measured channel (row) with each command (column), over
-    delays up to LARGEST_SHIFT_S either way; 0 where one of them is constant, and at least 0."""
+def _correlations(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Delays (S,) of the measured channels up to LARGEST_SHIFT_S either way [s], and at each of
+    them the correlation (S, m, m) of each measured channel (row) with each command (column): 0
+    where one of them is constant, and at least 0."""
     commanded, measured = recording.commanded, recording.measured
     assert commanded is not None, "only recordings with a command are compared"
     steps = 0 if recording.kind == "settled" else round(LARGEST_SHIFT_S / SHIFT_S)
     every = max(1, -(-len(measured) // MOST_ROWS))
     clock, begin, end = _clock(recording)
     asked, own, begin, end = (part[::every] for part in (clock, measured, begin, end))
-    found = np.zeros((recording.chambers, recording.chambers))
-    for shift in SHIFT_S * np.arange(-steps, steps + 1):
+    shifts = SHIFT_S * np.arange(-steps, steps + 1)
+    found = np.zeros((len(shifts), recording.chambers, recording.chambers))
+    for place, shift in enumerate(shifts):
         at = asked - shift
         inside = (at >= begin) & (at <= end)
         row = np.searchsorted(clock, at[inside] + 1e-9, side="right") - 1
@@ -111,8 +189,8 @@ def _correlations(recording: Recording) -> np.ndarray:
         moves = size > 1e-9 * np.abs(both).max(axis=0) * np.sqrt(len(both))
         unit = np.where(moves, from_mean / np.where(moves, size, 1.0), 0.0)
         m = recording.chambers
-        found = np.maximum(found, unit[:, :m].T @ unit[:, m:])
-    return found
+        found[place] = np.maximum(unit[:, :m].T @ unit[:, m:], 0.0)
+    return shifts, found
 
 
 def _step(recording: Recording, time_unit: str | None) -> list[str]:

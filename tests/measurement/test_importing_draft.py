@@ -210,7 +210,7 @@ def test_columns_called_as_the_command_are_taken_for_its_measured_values(
     path.write_text(f"{header},x,y,z\n" + ",".join("1" * count) + "\n")
     text = draft_map(path)
     assert f"columns = [{measured}]" in text.split("[measured]")[1].split("[commanded]")[0]
-    assert ("called as the command's" in text) == ("set1" not in measured)
+    assert ("the names are like the command's" in text) == ("set1" not in measured)
 
 
 def test_a_draft_of_one_of_two_files_says_what_it_lacks(tmp_path, monkeypatch, capsys):

@@ -110,7 +110,8 @@ class _Recognised:
     commanded: list[int]
     """Columns of the commanded actuation."""
     by_command: bool
-    """Whether the measured columns are recognised only because they are called as the command's."""
+    """Whether the measured columns are recognised only because their names are like those of the
+    command."""
     runs: int | None
     """Column in which a new value begins a new run."""
 
@@ -342,7 +343,7 @@ def _actuation(
     """The tables [measured] and [commanded]; sensed, wanted: the files that have their columns."""
     doubt = "" if wanted else "  # check: measured by sensors? Set values are [commanded]"
     if sensed and sensed[1].by_command:
-        doubt = "  # check: taken for the measured values because they are called as the command's"
+        doubt = "  # check: taken for measured values, because the names are like the command's"
     if not sensed and wanted:
         doubt = "  # check: set values stand in, no sensor is here; fit with --actuation commanded"
     lines = []

@@ -178,7 +178,7 @@ def _draft(raw: list[Path], place: Path, force: bool) -> None:
 
 def _test_setup(arm: "ArmModel", name: str, recordings: list) -> None:
     """Print what a model shows to be wrong with the set-up of recordings; name: of the model."""
-    from surgisoft.diagnosis.residuals import fit_of_model
+    from surgisoft.diagnosis.residuals import WHOSE_ARM, fit_of_model
     from surgisoft.diagnosis.setup import find_setup_faults
 
     found = find_setup_faults(arm, recordings)
@@ -193,8 +193,7 @@ def _test_setup(arm: "ArmModel", name: str, recordings: list) -> None:
             return
         warn(
             f"set-up: {name} does not describe this arm's motion of {fit.motion_mm:.3g} mm "
-            f"({error}), and no fault that is tested explains it: check that MODEL is of this arm, "
-            "and in the map the columns of [measured] and [key_points], their units and [frame]"
+            f"({error}), and no fault that is tested explains it: {WHOSE_ARM}"
         )
         return
     warn(f"set-up: {found.sentence}")

@@ -58,11 +58,11 @@ Kind = Literal[
 ]
 NAMING: tuple[Kind, ...] = ("identified", "several", "ambiguous")
 """Kinds of result that name effects."""
-Reason = Literal["network", "learned", "repeatability", "few_data", "schedule", "before"]
+Reason = Literal["network", "learned", "repeatability", "few_data", "schedule", "before", "arm"]
 """Why a diagnosis cannot tell: the model is not that of this arm; the model has learned part of
 what is missing; how well recordings of an unchanged arm agree is not known well enough; there are
 too few motions; the schedule does not tell effects apart; the model does not describe the
-recordings from before a change."""
+recordings from before a change; even with the most probable effect it leaves most of the motion."""
 
 SCHEMA = 8
 """Version of the asset's format and of the features: weights belong to the features that they were

@@ -70,10 +70,12 @@ from surgisoft.diagnosis.pairs import BeforeAfter, Change, ChangeTrack, Paired, 
 from surgisoft.diagnosis.refit import LINE_OR_WALL, Refit, beside, can_hide, refit_reason
 from surgisoft.diagnosis.refit import refit as fit_candidates_together
 from surgisoft.diagnosis.residuals import (
+    WHOSE_ARM,
     Problem,
     ResidualTable,
     Sealed,
     floor_in_words,
+    model_fit,
     residual_table,
 )
 from surgisoft.diagnosis.selection import (
@@ -147,12 +149,15 @@ REASONS = {
     "the differences between recordings of an unchanged arm: record the same schedule twice before "
     "a change, so that these differences are known",
     "before": "the model does not describe the recordings from before the change",
+    "arm": "even with the most probable effect the model leaves most of the motion",
     "few_data": "the recordings contain too few different motions",
     "schedule": "on these recordings no cause is probable enough to be named",
 }
 """Why a diagnosis cannot tell, or why it calls the model off, in words; {size}: the error beside
 the validated one (`ErrorLevels.size`)."""
 
+CANNOT_TELL = "cannot tell what is missing, if anything"
+"""Begin of the sentence of `cannot_tell`."""
 MENTIONED = {
     "identified": "{} is missing",
     "several": "{} are missing",
@@ -459,7 +464,8 @@ def diagnose(
             result = with_refit(result, joint, problem)
         if result.verdict.kind == "unknown_effect":
             result = with_axis(result, problem)
-        if reference is None and not problem.in_fit and faster_than_fit(model.spec, whole):
+        known = result.verdict.reason != "arm" and not problem.in_fit
+        if reference is None and known and faster_than_fit(model.spec, whole):
             report("what has changed since the fit")
             changed = changed_since_fit(table, without, (problem, tried))
             result = replace(result, since_fit=changed)
@@ -597,7 +603,7 @@ def without_before(both: BeforeAfter) -> Diagnosis:
     """
     problem = both.plain.training()
     best = best_achievable(problem, black_box(problem), None)
-    head = f"since {both.names}: cannot tell what is missing, if anything"
+    head = f"since {both.names}: {CANNOT_TELL}"
     return Diagnosis(
         verdict=Verdict("cannot_tell", (), f"{head}: {both.strange_in_words}", reason="before"),
         error_mm=ErrorLevels(problem.rmse_mm, problem.told_floor_mm, best.rmse_mm),
@@ -750,7 +756,6 @@ def result_of(
     decision = decision or decide(evidence)
     in_fit = problem.in_fit
     where = LEFT_OUT if in_fit else HELD_OUT
-    kind, effects, sure = decision.kind, decision.effects, decision.confidence
     levels = ErrorLevels(
         problem.rmse_mm,
         problem.told_floor_mm,
@@ -758,10 +763,16 @@ def result_of(
         validated=None if evidence.paired else problem.rmse_mm / evidence.error_over_validated,
         discrepancy_alone=found.selection.rmse_mm(found.selection.losses()),
     )
+    other_arm = "" if evidence.paired else of_another_arm(found, decision)
+    if other_arm:
+        decision = replace(decision, kind="cannot_tell", effects=(), reason="arm")
+    kind, effects, sure = decision.kind, decision.effects, decision.confidence
     ranking = tuple(_ranked(found, score, decision) for score in _order(found, decision))
     static = evidence.free_static >= MOSTLY_STATIC * evidence.free_box
     near, reached = nearest(ranking), _reached(found, effects, kind)
     sentence = sentence_of(decision, levels, reached, where, static, near)
+    if other_arm:
+        sentence = f"{CANNOT_TELL}: {other_arm}; {levels.in_words}"
     others = _instead(evidence) if kind == "several" else ()
     if others:
         sentence += (
@@ -801,6 +812,22 @@ def result_of(
         next_command=next_command(decision, problem.model.trainable),
         in_fit=in_fit,
         along=along,
+    )
+
+
+def of_another_arm(found: Findings, decision: Decision) -> str:
+    """Why no effect may be named: with those that the decision names the model still leaves so much
+    of the motion that it does not describe this arm (`ModelFit.fits`); empty where it does."""
+    if decision.kind not in NAMING:
+        return ""
+    fit = model_fit(found.problem.table)
+    left_mm = min(_reached(found, decision.effects, decision.kind))
+    if fit is None or fit.fits or fit.describes(left_mm):
+        return ""
+    named = (" or " if decision.kind == "ambiguous" else " and ").join(decision.effects)
+    return (
+        f"with {named} {left_mm:.3g} mm would remain of a motion of {fit.motion_mm:.3g} mm, so the "
+        f"model does not describe this arm: {WHOSE_ARM}"
     )
 
 
@@ -1104,7 +1131,7 @@ def sentence_of(
         why = _why(decision.reason or "schedule", levels, static)
         most = _most_probable(decision)
         most = f" (most probable: {most})" if most else ""
-        return f"cannot tell what is missing, if anything: {why}{most}; {error}"
+        return f"{CANNOT_TELL}: {why}{most}; {error}"
     return f"these recordings show no missing effect (confidence {sure:.2f}); {error}"
 
 
@@ -1168,7 +1195,7 @@ def next_command(decision: Decision, trainable: bool = True) -> str:
     plan += " -o SCHEDULE.csv"
     if kind == "ambiguous":
         return plan
-    if decision.reason == "network" or (kind == "surrogate_undertrained" and not decision.reason):
+    if decision.reason in ("network", "arm") or (kind == "surrogate_undertrained" and not decision.reason):
         return "surgisoft fit {data} -o NEW"
     if decision.reason == "learned" and trainable:
         return "surgisoft diagnose {model} {data} --refit always"

@@ -501,10 +501,14 @@ def next_effects(found: Diagnosis, added: Sequence[str] = ()) -> tuple[str, ...]
     Later that one itself has to be more likely missing than not: what an added effect's formula
     gets wrong looks as much like another effect (docs/results/decision.md#two-effects-and-improve).
 
+    None is tried where the model does not describe the arm.
+
     added: effects of former rounds.
     """
     kind, chances = found.verdict.kind, found.probabilities
     effects = found.verdict.effects
+    if found.verdict.reason == "arm":
+        return ()
     if kind == "cannot_tell" and chances is not None:
         first = next(iter(chances.effects), None)
         if first is None or first in added:

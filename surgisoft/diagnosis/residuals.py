@@ -716,6 +716,11 @@ def noise_of_validation(model: ArmModel, noise_mm: np.ndarray) -> np.ndarray:
 LEFT_OF_MOTION = 0.35
 """Most error of a model of this arm, as a share of the motion of the key points: with a correct
 set-up it predicts most of the motion, whatever physics is missing."""
+WHOSE_ARM = (
+    "check that MODEL is of this arm, and in the map the columns of [measured] and [key_points], "
+    "their units and [frame]"
+)
+"""What to do where a model does not describe an arm."""
 NOTICED = 1.5
 """Least error that is noticed, as a multiple of the validated error and the noise together."""
 
@@ -736,10 +741,14 @@ class ModelFit:
     def fits(self) -> bool:
         """Whether the recordings can be of the model's arm: it predicts most of their motion, as it
         does whatever physics is missing. True of an arm that hardly moves, which shows nothing."""
+        return self.describes(self.rmse_mm)
+
+    def describes(self, left_mm: float) -> bool:
+        """Whether an error [mm], of the model or with an effect added, is as small as `fits` has
+        it."""
         if self.motion_mm <= NOTICED * self.expected_mm:
             return True
-        most = max(LEFT_OF_MOTION * self.motion_mm, NOTICED * self.expected_mm)
-        return self.rmse_mm <= most
+        return left_mm <= max(LEFT_OF_MOTION * self.motion_mm, NOTICED * self.expected_mm)
 
 
 def model_fit(table: ResidualTable) -> ModelFit | None:

@@ -5,12 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from surgisoft.diagnosis.diagnose import diagnose
+from surgisoft.diagnosis.improve import next_effects
 from surgisoft.diagnosis.residuals import ModelFit, fit_of_model
 from surgisoft.errors import InputError
 from surgisoft.surrogate.checkpoint import default_arm
 from surgisoft.surrogate.model import Validation
 from tests.diagnosis.setup.recordings import NOISE_MM, measured, predicted, with_points
 from tests.diagnosis.synthetic import recording, still_model, walk
+from tests.diagnosis.test_estimation import bare_arm, measured_on
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +57,27 @@ def test_a_model_fits_with_35_percent_of_the_motion_or_with_half_more_than_its_e
 ):
     """An error of 1 mm is expected; below 1.5 mm of motion nothing shows."""
     assert ModelFit(rmse_mm, 1.0, motion_mm).fits is fits
+
+
+def test_no_effect_is_named_that_leaves_most_of_the_motion():
+    """Actuation that is eight times too large, which is no ratio of units: an effect explains most
+    of an error of four times the motion, and the rest is still more than a third of the motion."""
+    arm = bare_arm()
+    right = measured_on(arm)
+    wrong = replace(right, measured=8 * right.measured)
+    motion_mm = fit_of_model(arm, [wrong]).motion_mm
+    found = diagnose(arm, [wrong], setup_tests=False, refit="never")
+    assert (found.verdict.kind, found.verdict.reason, found.verdict.effects) == (
+        "cannot_tell",
+        "arm",
+        (),
+    )
+    assert max(found.probabilities.effects.values()) > 0.5, "one would have been named"
+    best_mm = min(row.heldout_rmse_mm for row in found.ranking)
+    assert 0.35 * motion_mm < best_mm < found.error_mm.before / 4
+    assert "so the model does not describe this arm: check that MODEL" in found.verdict.sentence
+    assert found.next_command == "surgisoft fit {data} -o NEW"
+    assert next_effects(found) == (), "improve tries none either"
 
 
 def test_the_expected_error_is_that_of_the_model_and_the_noise_together():

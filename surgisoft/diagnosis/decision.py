@@ -1015,10 +1015,10 @@ def reason_of(evidence: Evidence, chances: Probabilities) -> Reason:
         return "network"
     elif evidence.error_over_validated <= CLAIM.most_over_validated and memory >= LEARNED:
         return "learned"
-    return _few_or_schedule(evidence)
+    return few_or_schedule(evidence)
 
 
-def _few_or_schedule(evidence: Evidence) -> Reason:
+def few_or_schedule(evidence: Evidence) -> Reason:
     """The reason that lies in the recordings."""
     few = FEW_PAIRED_MOTIONS if evidence.paired else FEW_MOTIONS
     return "few_data" if evidence.motions < few else "schedule"
@@ -1032,4 +1032,4 @@ def of_change(decision: Decision, evidence: Evidence) -> Decision:
     if decision.reason != "learned":
         return decision
     off = decision.kind == "surrogate_undertrained"
-    return replace(decision, reason=None if off else _few_or_schedule(evidence))
+    return replace(decision, reason=None if off else few_or_schedule(evidence))

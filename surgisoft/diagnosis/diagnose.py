@@ -48,6 +48,7 @@ from surgisoft.diagnosis.decision import (
     Statement,
     claimable,
     decide,
+    few_or_schedule,
     of_change,
     worth_of_nothing,
 )
@@ -128,6 +129,10 @@ LOCAL = 3.0
 error is called local. Chosen on three robots of a trial, 36 blocks each, between the largest ratio
 of an unchanged arm (2.5) and the least one of an arm that touched a wall (3.2). It adds a check,
 and no result depends on it."""
+SHORT_S = 60.0
+"""Duration of the rows looked at below which candidates are not fitted together with the network,
+unless an effect is named that the network could do as well [s]: twelve motions of five seconds. The
+errors of so few motions, a third of which is left out of each training, prove no effect."""
 NO_PAST = (
     "the model does not keep what is needed to tell what has changed since its fit: give the "
     "recordings of the fit by --before"
@@ -456,6 +461,10 @@ def diagnose(
         del found  # hundreds of MB
         if not reason and refit == "auto" and model.trainable:
             reason = reason_of_result(result.verdict)
+        if reason and refit == "auto" and result.verdict.kind not in NAMING:
+            seconds = recorded_s(problem)
+            if seconds is not None and seconds < SHORT_S:
+                reason, result = "", too_short(result, seconds)
         if reason:
             cannot = [*without, *(each.effect for each in not_testable)]
             joint = fit_candidates_together(
@@ -476,6 +485,39 @@ def diagnose(
     valves = valve_hints(whole, earlier, model.spec.actuation)
     checks = (*alarm_hints(whole, recordings), *gap_hints(whole), *valves, *result.checks)
     return replace(result, checks=checks, notes=notes, seconds=time.perf_counter() - begin)
+
+
+def recorded_s(problem: Problem) -> float | None:
+    """Duration of the rows looked at, s: the sum over their blocks of time; None for samples
+    without a clock."""
+    along = error_along(problem)
+    return None if along is None else float(np.sum(np.subtract(along.to_s, along.from_s)))
+
+
+def too_short(result: Diagnosis, seconds: float) -> Diagnosis:
+    """The diagnosis of recordings on which no fit with the network could prove an effect, and which
+    say nothing of what it has learned.
+
+    seconds: duration of the rows looked at, s.
+    """
+    verdict, chances = result.verdict, result.probabilities
+    check = (
+        f"the diagnosis looked at {seconds:.0f} s of motion, expected {SHORT_S:.0f} s or more to "
+        "fit candidates together with the network, which may have learned part of what is missing: "
+        "record more motion, or use --refit always"
+    )
+    result = replace(result, checks=(*result.checks, check))
+    if verdict.kind != "cannot_tell" or chances is None:
+        return result
+    decision = Decision(
+        "cannot_tell", (), verdict.confidence, chances, "few_data", result.statements
+    )
+    sentence = sentence_of(decision, result.error_mm, [result.error_mm.before])
+    return replace(
+        result,
+        verdict=replace(verdict, sentence=sentence, reason="few_data"),
+        next_command=next_command(decision),
+    )
 
 
 def reason_of_result(verdict: Verdict) -> str:
@@ -712,7 +754,7 @@ def with_refit(result: Diagnosis, joint: Refit, problem: Problem) -> Diagnosis:
         checks = (*checks, joint.sentence)
         if evidence is not None and chances is not None and tried.issuperset(verdict.effects):
             quiet = chances.nothing + chances.network
-            none = Decision("cannot_tell", (), quiet, chances, "schedule")
+            none = Decision("cannot_tell", (), quiet, chances, few_or_schedule(evidence))
             if claimable(evidence) and worth_of_nothing(quiet) > 0.0:
                 none = Decision("nothing_missing", (), quiet, chances)
             if verdict.effects or verdict.reason == "learned":
@@ -985,11 +1027,17 @@ def local_error(along: ErrorAlong | None, recordings: int = 1) -> list[str]:
     worst = int(np.argmax(along.rmse_mm))
     turn = ", all recordings in turn" * (recordings > 1)
     return [
-        f"the error is concentrated from {along.from_s[worst]:.0f} to {along.to_s[worst]:.0f} s"
-        f"{turn}: {along.rmse_mm[worst]:.3g} mm, {along.rmse_mm[worst] / along.typical_mm:.1f} "
+        f"the error is concentrated from {_stretch(along.from_s[worst], along.to_s[worst])}{turn}: "
+        f"{along.rmse_mm[worst]:.3g} mm, {along.rmse_mm[worst] / along.typical_mm:.1f} "
         "times the median of all blocks of time (possible causes: the arm touches something, a "
         "part gives way); 'surgisoft compare --report' shows where on the body"
     ]
+
+
+def _stretch(from_s: float, to_s: float) -> str:
+    """A stretch of time in words, to as many digits as tell its ends apart."""
+    digits = next((n for n in range(3) if to_s - from_s >= 10.0**-n), 3)
+    return f"{from_s:.{digits}f} to {to_s:.{digits}f} s"
 
 
 def _left_by(found: Findings, effects: tuple[str, ...]) -> float:
@@ -1195,7 +1243,9 @@ def next_command(decision: Decision, trainable: bool = True) -> str:
     plan += " -o SCHEDULE.csv"
     if kind == "ambiguous":
         return plan
-    if decision.reason in ("network", "arm") or (kind == "surrogate_undertrained" and not decision.reason):
+    if decision.reason in ("network", "arm") or (
+        kind == "surrogate_undertrained" and not decision.reason
+    ):
         return "surgisoft fit {data} -o NEW"
     if decision.reason == "learned" and trainable:
         return "surgisoft diagnose {model} {data} --refit always"

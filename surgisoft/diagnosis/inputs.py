@@ -102,10 +102,10 @@ def refuse_amended(
         if seen.effects_in_words:
             names = " + ".join(each.name for each in before)
             raise InputError(
-                f"{recording.label}: {seen.effects_in_words}, expected a model from before the change: "
-                f"compared with {names}, what these effects explain would be found again; leave "
-                "out --before, or run 'surgisoft improve' on the model as it was before these "
-                "effects were added"
+                f"{recording.label}: {seen.effects_in_words}, expected a model from before the "
+                f"change: compared with {names}, what these effects explain would be found again; "
+                "leave out --before, or run 'surgisoft improve' on the model as it was before "
+                "these effects were added"
             )
 
 

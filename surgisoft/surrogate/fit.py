@@ -112,7 +112,10 @@ class ChamberExcitation:
         if self.minor_loops:
             return ""
         if self.reversals < LEAST_REVERSALS:
-            why = f"it reversed only {self.reversals} times"
+            often = "never reversed"
+            if self.reversals:
+                often = f"reversed only {self.reversals} time{'s' * (self.reversals > 1)}"
+            why = f"it {often}"
         elif self.contrast < LEAST_CONTRAST:
             why = (
                 "its direction follows from the pressures themselves "

@@ -15,7 +15,7 @@ from surgisoft.diagnosis import diagnose as diagnosing
 from surgisoft.diagnosis import improve as improving
 from surgisoft.diagnosis import refit as refitting
 from surgisoft.diagnosis.candidates import with_effect
-from surgisoft.diagnosis.decision import Decision
+from surgisoft.diagnosis.decision import Decision, Probabilities
 from surgisoft.diagnosis.diagnose import (
     Diagnosis,
     ErrorLevels,
@@ -552,6 +552,34 @@ def test_what_the_network_has_learned_leads_to_a_refit(
     result = diagnosing.diagnose(off, [recording], refit=mode, setup_tests=False)
     assert result.verdict.effects[:1] == effects
     assert (result.refit is found) == bool(effects)
+
+
+def test_half_a_minute_of_motion_is_no_case_for_a_refit(lagging, found, monkeypatch):
+    """Unless it is asked for; and few motions are the reason why nothing can be told."""
+    recording, model = lagging
+    off = model.replace(validation=Validation(0.1, (0.1,) * model.spec.key_points, 300))
+    off.fitted_rows = None
+    part = {
+        name: getattr(recording, name)[:400]
+        for name in ("t_s", "measured", "commanded", "key_points_mm", "run")
+    }
+    none = replace(
+        named(None, found),
+        verdict=Verdict("cannot_tell", (), "why", 0.5, "learned"),
+        probabilities=Probabilities(0.4, 0.2, 0.0, {"line_lag": 0.4}, 0.0, ()),
+    )
+    monkeypatch.setattr(diagnosing, "result_of", lambda findings: none)
+    monkeypatch.setattr(diagnosing, "fit_candidates_together", lambda *given, **more: found)
+    auto, always = (
+        diagnosing.diagnose(off, [replace(recording, **part)], refit=mode, setup_tests=False)
+        for mode in ("auto", "always")
+    )
+    assert auto.refit is None
+    assert (auto.verdict.kind, auto.verdict.reason) == ("cannot_tell", "few_data")
+    assert "anything: the recordings contain too few different motions" in auto.verdict.sentence
+    assert "looked at 28 s of motion, expected 60 s or more" in auto.checks[-1]
+    assert auto.next_command.startswith("surgisoft next-experiment")
+    assert always.refit is found
 
 
 def test_an_error_beyond_the_validated_one_is_left_to_the_residuals(problem):

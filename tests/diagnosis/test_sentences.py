@@ -247,6 +247,9 @@ def test_an_error_that_is_large_in_one_stretch_is_called_local(here_mm, told):
             "concentrated from 10 to 14 s: 4.1 mm, 3.1 times the median of all blocks" in found[0]
         )
         assert "from 10 to 14 s, all recordings in turn: 4.1 mm" in local_error(along, 2)[0]
+        begin, end = ([value / 12 for value in ends] for ends in (along.from_s, along.to_s))
+        short = replace(along, from_s=tuple(begin), to_s=tuple(end))
+        assert "concentrated from 0.8 to 1.2 s: 4.1 mm" in local_error(short)[0]
     shown = Diagnosis(Verdict("nothing_missing", (), ""), LEVELS, (), along=along)
     (picture,) = next(
         part.parts

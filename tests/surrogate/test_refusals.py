@@ -344,7 +344,8 @@ def test_why_a_chamber_supports_no_memory():
         ChamberExcitation(1, 0.9, 99, 0.0),
         ChamberExcitation(1, 0.9, 99, 0.9),
     )
-    assert few.unsupported() == "chamber 1: it reversed only 1 times"
+    assert few.unsupported() == "chamber 1: it reversed only 1 time"
+    assert replace(few, reversals=0).unsupported() == "chamber 1: it never reversed"
     assert (
         "its direction follows from the pressures themselves (contrast 0.00" in same.unsupported()
     )

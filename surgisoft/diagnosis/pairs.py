@@ -94,6 +94,8 @@ LEAST_SHARE = 0.5
 """Share of the training rows of AFTER that must have a partner for the paired difference to be
 used: it says nothing of the other rows. Two schedules of ten minutes that were drawn by chance have
 minutes of rest and of equal ramps in common, which need not show what changed."""
+NOISIER = 1.5
+"""Noise of AFTER, as a multiple of that of BEFORE, from which on it is told where it counts."""
 LEAST_ROWS = 2 * LEAST_BLOCKS * BLOCK_ROWS
 """Fewest rows with a partner, in any case."""
 LEAST_S = 60.0
@@ -306,6 +308,22 @@ class Change:
     unchanged_mm: float | None = None
     """RMS paired difference that an arm shows where nothing has changed, mm: a difference of two
     recordings, to be compared with `change_mm`; None without pairs."""
+    noise_mm: tuple[float, float] | None = None
+    """RMS noise of BEFORE and of AFTER, which is a part of `unchanged_mm`, mm; None without
+    pairs."""
+
+    @property
+    def _source(self) -> str:
+        """What `unchanged_mm` is computed from, in words."""
+        source = self.repeatability_source
+        if self.noise_mm is None or self.noise_mm[1] < NOISIER * self.noise_mm[0]:
+            return source
+        before, after = self.noise_mm
+        more = "" if source == "noise" else " and noise"
+        return (
+            f"{source}{more}, which is {after:.3g} mm in these recordings and {before:.3g} mm in "
+            "those before"
+        )
 
     @property
     def sentence(self) -> str:
@@ -323,7 +341,7 @@ class Change:
         return (
             f"{100 * self.paired_share:.0f} % of the rows are paired with {names} (delay "
             f"{', '.join(delays)}); change {self.change_mm:.3g} mm, expected of an unchanged arm "
-            f"{self.unchanged_mm:.3g} mm (from {self.repeatability_source})"
+            f"{self.unchanged_mm:.3g} mm (from {self._source})"
         )
 
     def to_json(self) -> dict:
@@ -1017,6 +1035,11 @@ def rms_by_point(field_mm: np.ndarray) -> np.ndarray:
     return np.sqrt(np.nansum(square, axis=0) / np.maximum(count, 1))
 
 
+def _rms(per_key_point_mm: np.ndarray) -> float:
+    """RMS over key points (n,), mm."""
+    return float(np.sqrt(np.mean(np.square(per_key_point_mm))))
+
+
 def slope_error(table: ResidualTable) -> float:
     """Error of a model's slopes as a share of them, at most 1.
 
@@ -1104,6 +1127,7 @@ class BeforeAfter:
             mismatch=float(np.sqrt(np.average(mismatch**2, weights=counts))),
             stretches=pairs.stretches,
             unchanged_mm=float(np.sqrt(np.mean(np.square(pairs.unchanged_mm(training))))),
+            noise_mm=(_rms(pairs.earlier.noise_mm), _rms(pairs.after.noise_mm)),
         )
 
     def with_final_check(self) -> "BeforeAfter":

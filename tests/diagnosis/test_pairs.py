@@ -306,6 +306,26 @@ def test_the_change_of_an_unchanged_arm_is_the_one_that_is_printed_beside_it(mod
     assert change.to_json()["unchanged_mm"] == change.unchanged_mm
 
 
+def test_more_noise_after_is_told_beside_what_an_unchanged_arm_would_show(model):
+    """BEFORE is repeated, and cameras scatter four times as much after it."""
+    motion = smooth_walk(7)
+    *before, after = (made(motion, 0.0, seed=seed, name=f"take{seed}") for seed in (0, 1, 2))
+    noise = np.random.default_rng(9).normal(0.0, NOISE_MM, after.key_points_mm.shape)
+    louder = replace(
+        after,
+        key_points_mm=after.key_points_mm + np.sqrt(15) * noise,
+        noise_mm=4 * NOISE_MM,
+    )
+    change, same = (
+        before_and_after(residual_table(model, [each]), before).change for each in (louder, after)
+    )
+    one_mm = np.sqrt(3) * NOISE_MM
+    assert change.unchanged_mm == pytest.approx(np.sqrt(16 + 1 / 2) * one_mm, rel=0.05)
+    said = f"(from repeats and noise, which is {4 * one_mm:.3g} mm in these recordings and "
+    assert f"{said}{one_mm:.3g} mm in those before)" in change.sentence
+    assert "(from repeats)" in same.sentence
+
+
 def test_noise_of_a_measured_actuation_is_no_change(model):
     """A network with a slope turns the sensor's noise into motion that no arm made."""
     steep = copy.deepcopy(default_arm())

@@ -31,6 +31,7 @@ from surgisoft.cli.options import (
     complete_effects,
     given_options,
     model_options,
+    typed_once,
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
@@ -157,7 +158,7 @@ def amend(
     print(result.sentence)
     if saved:
         print(f"wrote {output}: {result.model.summary()}")
-        files = typed(*data)
+        files = typed_once(data)
         same = model_options(None, model_error)
         same += given_options({"--refit": None if refit == "auto" else refit})
         following = f"surgisoft diagnose {typed(output)} {files}{same}"

@@ -29,6 +29,7 @@ from surgisoft.cli.options import (
     Report,
     before_options,
     model_options,
+    typed_once,
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
@@ -163,7 +164,7 @@ def compare(
     show_written(written)
     best = min(range(len(compared)), key=lambda i: compared[i].result.rmse_mm)
     if compared[best].result.explainable:
-        names = typed(*recordings)
+        names = typed_once(recordings)
         since = before_options(before, paired)
         its_error = model_error if not others or takes_error(models[best]) else None
         since += model_options(predictions, its_error)

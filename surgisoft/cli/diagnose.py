@@ -37,6 +37,7 @@ from surgisoft.cli.options import (
     before_files,
     complete_effects,
     model_options,
+    typed_once,
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
@@ -140,7 +141,7 @@ def diagnose(
             error_mm=model_error,
         )
     warn_all(found.notes)
-    data = typed(*recordings)
+    data = typed_once(recordings)
     # Predictions of `--before` come last.
     of_model = model_options((predictions or [])[: len(measured)], model_error)
     following = ""

@@ -31,6 +31,7 @@ from surgisoft.cli.options import (
     before_options,
     given_options,
     model_options,
+    typed_once,
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
@@ -127,7 +128,7 @@ def improve(
         last = output if result.claimed else model
         # What was amended to a change is not compared with the recordings from before it again.
         earlier_files = None if result.claimed else before
-        given = (typed(*recordings), before_files(earlier_files, paired))
+        given = (typed_once(recordings), before_files(earlier_files, paired))
         found = result.diagnoses[-1]
         command = (
             with_effect_files(found.command(typed(last), *given)) if found.next_command else ""
@@ -137,13 +138,20 @@ def improve(
         written.append(write_before_and_after(result, tables, model.name, replay))
     _show(result)
     show_written(written)
-    print(result.sentence)
+    # The last round has told why.
+    told = f": {result.rounds[-1].sentence}" if result.rounds else ""
+    print(result.sentence.removesuffix(told))
     if not result.claimed:
         print(f"{output} was not written")
-        raise typer.Exit(INTERRUPTED if result.interrupted else NOT_CLAIMED)
+        if result.interrupted:
+            raise typer.Exit(INTERRUPTED)
+        read = typed_once(recordings), before_files(before, paired)
+        if again := _following(result, typed(model), read, model_options(None, model_error)):
+            print(f"next: {again}")
+        raise typer.Exit(NOT_CLAIMED)
     print(f"wrote {output}: {result.model.summary()}")
     if result.interrupted:
-        files = typed(*recordings)
+        files = typed_once(recordings)
         start = typed(model if before else output)
         same = {
             "--max-effects": None if most == MOST else most,
@@ -159,6 +167,26 @@ def improve(
     test = "TEST.parquet --test" if known is not None and known.complete else "TEST.parquet"
     following = with_effect_files(f"surgisoft compare {typed(model, output)} {test} --report PAGE")
     print(f"next, both models on an unseen recording: {following}")
+
+
+def _following(result, model: str, files: tuple[str, str], of_model: str) -> str:
+    """The command to run next where nothing was added: what `diagnose` recommends; empty where that
+    is to add the effect that did not lower the error.
+
+    model, files: the model, the recordings and those of `--before`, as they are typed.
+    """
+    from surgisoft.diagnosis.decision import NAMING
+
+    if result.steps or not result.diagnoses:
+        return ""
+    found = result.diagnoses[-1]
+    if found.setup is not None and found.setup.correctable:
+        again = f"surgisoft diagnose {model} {files[0]} --apply CORRECTED{of_model}"
+        return with_effect_files(again)
+    if not found.next_command or found.verdict.kind in NAMING:
+        return ""
+    command = found.command(model, *files)
+    return with_effect_files(command if command.split()[1] == "fit" else command + of_model)
 
 
 def _show(result) -> None:

@@ -20,6 +20,7 @@ from surgisoft.cli.options import (
     Predictions,
     complete_effects,
     model_options,
+    typed_once,
     with_effect_files,
 )
 from surgisoft.cli.options import Rig as RigOption
@@ -145,7 +146,7 @@ def _compared(before: list[Path] | None, paired: bool) -> str:
     """
     if not before:
         return ""
-    return f" --before {typed(*before)}" + (" --paired never" if paired else "")
+    return f" --before {typed_once(before)}" + (" --paired never" if paired else "")
 
 
 def _show(

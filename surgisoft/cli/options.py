@@ -10,6 +10,7 @@ from typer import Argument, Option
 
 from surgisoft.command_line import typed
 from surgisoft.errors import InputError
+from surgisoft.files import resolved
 
 SEED_MAX = 2**31
 """Largest seed that commands accept."""
@@ -155,12 +156,20 @@ def with_effect_files(command: str) -> str:
     return command + effects + (f" --model-code {typed(*named)}" if named else "")
 
 
+def typed_once(files: Iterable[Path]) -> str:
+    """Recordings and folders in a command to run next: one that is given twice is read once."""
+    once: dict[Path, Path] = {}
+    for file in files:
+        once.setdefault(resolved(file), file)
+    return typed(*once.values())
+
+
 def before_files(before: list[Path] | None, paired: str) -> str:
     """What follows `--before` in a command to run next: the recordings, and how to pair them, as
     this call was given them; empty without recordings."""
     if not before:
         return ""
-    return typed(*before) + ("" if paired == "auto" else f" --paired {paired}")
+    return typed_once(before) + ("" if paired == "auto" else f" --paired {paired}")
 
 
 def before_options(before: list[Path] | None, paired: str) -> str:

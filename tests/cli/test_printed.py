@@ -845,7 +845,7 @@ def test_after_a_fit_the_advice_keeps_the_validation_recordings(spaced, capsys, 
     assert run(["fit", spaced, "--valid", spaced, spaced, "-o", new]) == 0
     memory, error = capsys.readouterr().out.splitlines()[-2:]
     assert words_of(memory) == [
-        "surgisoft", "fit", spaced, "--valid", spaced, spaced, "--effects", "auto", "-o",
+        "surgisoft", "fit", spaced, "--valid", spaced, "--effects", "auto", "-o",
         f"{new}_with_effects",
     ]  # fmt: skip
     assert words_of(error)[:4] == ["surgisoft", "compare", new, "TEST.parquet"]
@@ -934,6 +934,55 @@ def test_each_policy_has_a_replay_of_its_own(tmp_path, capsys, monkeypatch):
     made.clear()
     assert run(["evaluate", "scripted", "--task", "track_circle", "--replay", file]) == 0
     assert made == {"r.v2.rrd": "log of scripted"}
+
+
+def test_a_file_given_twice_is_in_the_next_command_once(bench, capsys, monkeypatch):
+    rec = str(bench / "bench.parquet")
+    again = str(bench / ".." / bench.name / "bench.parquet")
+    found = diagnosis(next_command="surgisoft compare {model} {data}{before}", change=CHANGE)
+    command = ["diagnose", "default", rec, again, "--before", again, rec]
+    out = printed(capsys, monkeypatch, "surgisoft.diagnosis.diagnose.diagnose", found, *command)
+    assert out.endswith(f"next: surgisoft compare default {rec} --before {again}\n")
+
+
+@pytest.mark.parametrize(
+    ("found", "following"),
+    [
+        (
+            {"verdict": SimpleNamespace(kind="cannot_tell"), "next_command":
+             "surgisoft next-experiment {model} {data}{before} -o SCHEDULE.csv"},
+            "next: surgisoft next-experiment default {rec} -o SCHEDULE.csv\n",
+        ),
+        (
+            {"verdict": SimpleNamespace(kind="identified"), "next_command": "surgisoft amend"},
+            "",
+        ),
+        (
+            {"setup": SimpleNamespace(correctable=True)},
+            "next: surgisoft diagnose default {rec} --apply CORRECTED\n",
+        ),
+    ],
+)  # fmt: skip
+def test_improve_that_adds_nothing_says_why_once_and_what_is_next(
+    found, following, bench, capsys, monkeypatch
+):
+    why = SimpleNamespace(
+        verdict="cannot_tell", sentence="cannot tell: a long reason", step=None, anew=False,
+        together=False, competing=(), error_training_mm=0.5,
+    )  # fmt: skip
+    nothing = result(
+        claimed=False, rounds=[why], steps=[], diagnoses=[diagnosis(**found)],
+        sentence=f"nothing was added: {why.sentence}",
+    )  # fmt: skip
+    rec = str(bench / "bench.parquet")
+    new = str(bench / "not_written")
+    out = printed(
+        capsys, monkeypatch, "surgisoft.diagnosis.improve.improve", nothing,
+        "improve", "default", rec, "-o", new, code=1,
+    )  # fmt: skip
+    assert out.count(why.sentence) == 1
+    said = f"nothing was added\n{new} was not written\n"
+    assert out.endswith(said + following.format(rec=rec))
 
 
 def test_printed_commands_quote_paths_with_spaces(spaced, capsys, monkeypatch):

@@ -163,6 +163,8 @@ the validated one (`ErrorLevels.size`)."""
 
 CANNOT_TELL = "cannot tell what is missing, if anything"
 """Begin of the sentence of `cannot_tell`."""
+WITHOUT_SLIP = "surgisoft diagnose {model} REC_BEFORE_THE_SLIP{before}"
+"""What to run after a marker has slipped: the rows before it say what the arm lacks."""
 MENTIONED = {
     "identified": "{} is missing",
     "several": "{} are missing",
@@ -826,7 +828,10 @@ def result_of(
     told = slipped(evidence, recordings)
     if not told or evidence.jump_count > 1:
         told += jumping(evidence, recordings)
+    command = next_command(decision, problem.model.trainable)
     if kind == "unknown_effect":
+        if slipped(evidence):
+            command = WITHOUT_SLIP
         sentence += "".join(f"; {each}" for each in told)
         told = []
     plan = recommend(problem, effects).experiment if kind == "ambiguous" else None
@@ -851,7 +856,7 @@ def result_of(
         ),
         probabilities=decision.probabilities,
         statements=decision.statements,
-        next_command=next_command(decision, problem.model.trainable),
+        next_command=command,
         in_fit=in_fit,
         along=along,
     )

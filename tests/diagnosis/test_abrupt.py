@@ -212,3 +212,11 @@ def test_noise_makes_no_level():
     settled = replace(moved_by(stuck()), kind="settled")
     assert jump_level(still_model(), [settled]) == 0.0
     assert not len(jumps_in(residual_table(still_model(), [settled])).rows)
+
+
+def test_after_a_slip_the_next_step_is_a_diagnosis_of_the_rows_before_it():
+    slip = moved_by(bending() + shifted(1, 500, [0.0, 0.6, 0.0]))
+    found = diagnose(still_model(), [slip], setup_tests=False, refit="never")
+    assert found.verdict.kind == "unknown_effect"
+    assert "its marker has probably slipped, so use the rows before" in found.verdict.sentence
+    assert found.command("ARM", "REC") == "surgisoft diagnose ARM REC_BEFORE_THE_SLIP"

@@ -15,6 +15,7 @@ from surgisoft.cli.options import (
     Threads,
     complete_memories,
     given_options,
+    typed_once,
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
@@ -124,6 +125,7 @@ def fit(
 
     from surgisoft.measurement.fitting import fit as fit_model
     from surgisoft.surrogate.checkpoint import claim_folder, save_model
+    from surgisoft.surrogate.fit import rms_of_loss
     from surgisoft.surrogate.networks import parse_widths
 
     claim_folder(output, force)
@@ -135,7 +137,7 @@ def fit(
                 actuation=actuation,
                 threads=threads,
                 progress=lambda stage, epoch, of, loss: report(
-                    epoch, of, f"{stage}: held-out {loss:.4f} mm2"
+                    epoch, of, f"{stage}: held-out RMS {rms_of_loss(stage, loss):.4f} mm"
                 ),
                 network=network,
                 inputs=inputs,
@@ -169,7 +171,7 @@ def fit(
             "--threads": None if threads == 1 else threads,
         }
         new = typed(f"{output}_with_effects")
-        again = f"surgisoft fit {typed(*recordings)}{given_options(given)} --effects auto -o {new}"
+        again = f"surgisoft fit {typed_once(recordings)}{given_options(given)} --effects auto -o {new}"
         again = with_effect_files(again)
         print(f"next, whether the arm has memory that this model lacks: {again}")
     following = with_effect_files(

@@ -410,6 +410,15 @@ Progress = Callable[[str, int, int, float], None]
 """Called with (stage, epoch, epochs, validation loss in mm^2)."""
 
 
+def rms_of_loss(stage: str, loss: float) -> float:
+    """RMS distance of a key point that a loss of `Progress` [mm^2] stands for, mm.
+
+    The kernel's is the mean squared distance. The others are means over three coordinates, whose
+    weights by their range of motion have mean 2 (`range_weights`).
+    """
+    return math.sqrt(loss if stage == "kernel" else 3.0 / 2.0 * loss)
+
+
 def fit(
     train: History,
     valid: History | None,

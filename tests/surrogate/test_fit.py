@@ -13,7 +13,7 @@ from surgisoft.errors import InputError, Interrupted
 from surgisoft.surrogate import ensemble
 from surgisoft.surrogate.effects import hypothesis_of
 from surgisoft.surrogate.effects.twist import Twist
-from surgisoft.surrogate.fit import FitConfig, excitation, fit
+from surgisoft.surrogate.fit import FitConfig, excitation, fit, rms_of_loss
 from surgisoft.surrogate.history import pack
 from surgisoft.surrogate.interval import ErrorInterval, calibrate, coverage_of
 from surgisoft.surrogate.model import ArmModel
@@ -586,6 +586,14 @@ def test_a_fit_keeps_residuals_of_both_recordings_and_notes_what_hardly_moved(mo
     assert set(np.unique(np.asarray(result.known.residual_mm)[..., 0]).round(4)) == {0.0, 2.0}
     (note,) = [each for each in result.warnings if "hardly moved" in each]
     assert note.startswith(f"chamber 2 hardly moved ({0.1 * float(span[1]):.3g} kPa in all)")
+
+
+def test_a_loss_of_the_progress_is_told_as_a_distance():
+    """Every coordinate moves by 10 mm; all errors are (1, 2, 2) mm, 3 mm apart."""
+    measured = torch.tensor([[[0.0, 0.0, 0.0]], [[10.0, 10.0, 10.0]]])
+    loss = weighted_mse(measured + torch.tensor([1.0, 2.0, 2.0]), measured, range_weights(measured))
+    assert rms_of_loss("pressure", float(loss)) == pytest.approx(3.0)
+    assert rms_of_loss("kernel", 9.0) == 3.0
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,9 @@ SAME_ROWS = 0.1
 """Least share of the rows of the shorter of two recordings that both have, from which on they are
 the same measurement under two names. A row at rest before coarse sensors, which many recordings
 share, is less than that."""
+SHORT_FIT_S = 120.0
+"""Duration of continuous recordings below which a fit notes that they are short [s]: fewer than 24
+motions of five seconds, which `diagnose` calls few data, too."""
 
 
 def fit(
@@ -86,7 +89,23 @@ def fit(
         )
         model = result.model
         model.validation = replace(model.validation, jump_mm=jump_level(model, train))
+    result.warnings.extend(_short(train))
     return result
+
+
+def _short(train: list[Recording]) -> list[str]:
+    """A note where the training recordings are too short to show how the arm moves."""
+    if any(recording.kind != "continuous" for recording in train):
+        return []
+    runs = [recording.t_s[run] for recording in train for run in recording.runs]
+    seconds = float(sum(t_s[-1] - t_s[0] for t_s in runs))
+    if seconds >= SHORT_FIT_S:
+        return []
+    return [
+        f"the recordings last {seconds:.0f} s in all, expected two minutes or more, better ten: "
+        "the held-out rows resemble those of the training, and on other motions the error may be "
+        "many times as large"
+    ]
 
 
 @torch.no_grad()

@@ -180,3 +180,17 @@ def test_a_recording_under_two_names_is_not_fitted_twice(pair):
     ):
         fit([part, first], **quick)
     assert fit([first, other, moved], **quick).model.fitted_rows.count == 4500
+
+
+def test_a_fit_notes_recordings_of_less_than_two_minutes(pair):
+    quick = {"effects": [], "hidden": (8,), "epochs": 1, "prior": "none"}
+    some = recorded(1, rows=400)
+    seconds = sum(float(np.ptp(some.t_s[run])) for run in some.runs)
+    short, long = (
+        [note for note in fit(each, **quick).warnings if "two minutes or more" in note]
+        for each in (some, pair)
+    )
+    assert seconds < 60
+    (note,) = short
+    assert note.startswith(f"the recordings last {seconds:.0f} s in all, expected")
+    assert long == []

@@ -144,8 +144,9 @@ class ErrorInterval:
         if any(self.growth):
             further = self.nearest + FURTHER
             beyond = (
-                f", and within {self._radii(further)} mm where the actuation is {further:.0%} of a "
-                "chamber's range away from all of the training data"
+                " where the training data have nearly the same actuation, and within "
+                f"{self._radii(further)} mm where the actuation is {further:.0%} of a chamber's "
+                "range away from all of them"
             )
         few = f"; fewer than {EXACT_GROUPS}, so their RMS errors are taken to be log-normal"
         if self.groups < LEAST_GROUPS:

@@ -282,8 +282,9 @@ def test_the_sentence_says_in_millimetres_how_much_wider_the_interval_gets():
     quantile = 1.0 / 3.0
     found = ErrorInterval((LEVEL,), ((0.25, quantile),), (0.0, 100.0), 900, 30, "s", nearest=0.02)
     said = found.sentence()
-    assert "within (base to tip) 0.25 1.00 mm of the prediction, and within 0.25 4.33 mm " in said
-    assert "is 12% of a chamber's range away from all of the training data (s, 900 rows" in said
+    near = "0.25 1.00 mm of the prediction where the training data have nearly the same actuation"
+    assert f"within (base to tip) {near}, and within 0.25 4.33 mm where" in said
+    assert "is 12% of a chamber's range away from all of them (s, 900 rows" in said
     assert "away" not in replace(found, growth=(0.0, 0.0), nearest=0.0).sentence()
 
 

@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from surgisoft.diagnosis.amended_error import state_error, state_residuals
-from surgisoft.diagnosis.data_quality import FAR_ROWS, far_share
+from surgisoft.diagnosis.data_quality import FAR_ROWS, collinear_hints, far_share
 from surgisoft.diagnosis.diagnose import lacking_before
 from surgisoft.diagnosis.estimation.effects import fit_effects
 from surgisoft.diagnosis.estimation.intervals import Estimates, Parameter, beside_former
@@ -34,7 +34,7 @@ from surgisoft.files import with_former_keys
 from surgisoft.measurement.recordings import load_recordings
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
-from surgisoft.surrogate.effects import named_effects
+from surgisoft.surrogate.effects import FRONT, named_effects
 from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.workers import torch_threads
@@ -421,6 +421,8 @@ def amend(
     better.fitted_rows = own.joined(model.fitted_rows)
     found = Estimates(list(parameters), words)
     parameters, words = beside_former(found, model, problem.covered_s)
+    if any(better.effects[name].stage in FRONT for name in names):
+        notes = (*notes, *collinear_hints(plain))
     is_paired = both is not None and both.used
     # The paired difference holds for the network that predicted BEFORE.
     shown = fitted.model if is_paired else better

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
-from surgisoft.diagnosis.residuals import Problem
+from surgisoft.diagnosis.residuals import Problem, ResidualTable
+from surgisoft.measurement.histories import moved_together
 from surgisoft.measurement.recordings import AlarmInfo, Recording, after_alarm
 from surgisoft.measurement.recordings.clock import gaps_in_words
 from surgisoft.measurement.recordings.valves import changed_valves
@@ -97,6 +98,13 @@ def gap_hints(recordings: Sequence[Recording]) -> tuple[str, ...]:
         for recording in recordings
         if (found := gaps_in_words(recording))
     )
+
+
+def collinear_hints(table: ResidualTable) -> tuple[str, ...]:
+    """A sentence where channels hardly move apart from each other, or none: an effect of one of
+    them can then stand in for that of another."""
+    like = moved_together(table.pressure)
+    return (f"{like}: what is said of one may be of the other",) if like else ()
 
 
 def valve_hints(

@@ -30,6 +30,7 @@ from surgisoft.diagnosis.candidates import Candidate, candidates
 from surgisoft.diagnosis.criteria import SEARCH
 from surgisoft.diagnosis.data_quality import (
     alarm_hints,
+    collinear_hints,
     data_quality_warnings,
     gap_hints,
     thinning_notes,
@@ -844,6 +845,7 @@ def result_of(
         next_experiment=plan,
         checks=(
             *data_quality_warnings(problem),
+            *(collinear_hints(problem.table) if kind in NAMING else ()),
             *told,
             *(local_error(along, recordings) if kind not in NAMING else ()),
             *would_explain(found, decision),

@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass, field, replace
 
 from surgisoft.diagnosis.amend import Fall, Track, fall_of, of_change, track_of
 from surgisoft.diagnosis.amended_error import state_error, state_residuals
+from surgisoft.diagnosis.data_quality import collinear_hints
 from surgisoft.diagnosis.diagnose import (
     Diagnosis,
     diagnose,
@@ -43,6 +44,7 @@ from surgisoft.files import with_former_keys
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
+from surgisoft.surrogate.effects import FRONT
 from surgisoft.surrogate.effects.user_defined import kind_of
 from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.model import ArmModel
@@ -470,6 +472,9 @@ def improve(
         shown.append(replace(done, error_mm=fall_of(held_out, final).after))
     last = Estimates(list(made[-1].parameters), made[-1].in_words)
     parameters, words = beside_former(last, model, problem.covered_s)
+    new = [effect for name, effect in final_model.effects.items() if name in added]
+    if any(effect.stage in FRONT for effect in new):
+        notes = (*notes, *collinear_hints(table))
     result = Improvement(
         model=final_model,
         rounds=tuple(shown),

@@ -10,7 +10,13 @@ import numpy as np
 import torch
 
 from surgisoft.errors import InputError
-from surgisoft.measurement.histories import arm_spec, check_fits, history_of
+from surgisoft.measurement.histories import (
+    actuation_of,
+    arm_spec,
+    check_fits,
+    history_of,
+    moved_together,
+)
 from surgisoft.measurement.jumps import Motion, own_level_mm
 from surgisoft.measurement.noise import hold_noise, stated_noise
 from surgisoft.measurement.recordings import Recording, check_same_arm, load_recordings
@@ -90,6 +96,10 @@ def fit(
         model = result.model
         model.validation = replace(model.validation, jump_mm=jump_level(model, train))
     result.warnings.extend(_short(train))
+    if like := moved_together(np.concatenate([actuation_of(each, actuation) for each in train])):
+        result.warnings.append(
+            f"{like}: what each of them does alone cannot be learned from these recordings"
+        )
     return result
 
 

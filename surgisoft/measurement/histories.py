@@ -34,6 +34,9 @@ FASTER = 1.5
 """How many times as fast as in the training data an actuation may move without a note."""
 IDLE_SHARE = 0.02
 """A chamber that moved no more than this share of the widest range is ignored as not moved."""
+TOGETHER = 0.95
+"""Correlation of two channels, or of one with a sum of all others, from which on recordings hardly
+tell what each of them does [-]."""
 
 
 def actuation_of(recording: Recording, actuation: str) -> np.ndarray:
@@ -176,6 +179,35 @@ def faster_than_fit(spec: ArmSpec, recordings: list[Recording]) -> list[str]:
         "have lacked effects of speed from the start; fit it to motion as fast as this, too "
         "('surgisoft diagnose' tells what has changed since the fit)"
     ]
+
+
+def moved_together(actuation: np.ndarray) -> str:
+    """Which channels of an actuation (T, m) hardly move apart from each other, in words; empty for
+    none.
+
+    Two channels whose correlation is at least `TOGETHER`, and channels of which each follows from a
+    sum of the others as closely. Channels that hardly move are left aside.
+    """
+    spread = np.ptp(actuation, axis=0)
+    live = np.flatnonzero(spread > IDLE_SHARE * spread.max(initial=0.0))
+    if len(live) < 2:
+        return ""
+    r = np.corrcoef(actuation[:, live].T)
+    parts = [
+        f"channels {live[i] + 1} and {live[j] + 1} move "
+        f"{'together' if r[i, j] > 0 else 'against each other'} (r = {r[i, j]:.2f})"
+        for i in range(len(live))
+        for j in range(i + 1, len(live))
+        if abs(r[i, j]) >= TOGETHER
+    ]
+    # 1 - R^2 of a channel on all others is one over its element of the inverse of all r.
+    alone = 1.0 / np.diagonal(np.linalg.inv(r + 1e-6 * np.eye(len(live))))
+    if not parts:
+        summed = live[alone <= 1.0 - TOGETHER**2] + 1
+        if len(summed) > 2:
+            first, last = ", ".join(map(str, summed[:-1])), summed[-1]
+            parts = [f"each of channels {first} and {last} follows from the others"]
+    return ", ".join(parts)
 
 
 def _mean_temperature(recordings: list[Recording]) -> float | None:

@@ -281,6 +281,23 @@ def test_a_network_is_retuned_behind_an_effect_that_is_there_and_earns_it_no_cla
     assert without.held_out == without.alone
 
 
+def test_effects_of_channels_that_move_as_one_are_noted():
+    """Channels 1 and 2 against each other; a turned frame is no effect of a channel."""
+    free = measured_on(bare_arm(), runs=2, rows=200)
+    actuation = free.measured.copy()
+    actuation[:, 1] = actuation[:, 0].max() - actuation[:, 0]
+    tied = replace(free, measured=actuation)
+    said = "channels 1 and 2 move against each other (r = -1.00): what is said of one may be of"
+    for given, effect, told in (
+        (tied, "gain_mismatch", True),
+        (tied, "misalignment", False),
+        (free, "gain_mismatch", False),
+    ):
+        notes = amend(bare_arm(), [given], effect, retune_network=False, refit="never").notes
+        assert sum(said in note for note in notes) == told
+        assert sum("move against" in note for note in notes) == told
+
+
 def test_a_fall_is_claimed_where_it_is_significant_and_large():
     """Above the floor stand 1.0 mm: what counts is more than a twentieth of them."""
     fall = Fall(1.2, 1.0, 0.2, fall=0.2, ci95=(0.1, 0.3), rows=9, blocks=3)

@@ -11,6 +11,7 @@ from surgisoft.measurement.histories import (
     arm_spec,
     faster_than_fit,
     history_of,
+    moved_together,
     speed_of,
 )
 from surgisoft.measurement.recordings import Recording
@@ -111,3 +112,22 @@ def test_motion_that_is_faster_than_that_of_the_fit_is_noted():
     (note,) = faster_than_fit(settled, [triangles(8.0)])
     assert "and the recordings of the fit have steady states alone" in note
     assert faster_than_fit(settled, [triangles(8.0, kind="settled")]) == []
+
+
+def test_channels_that_move_as_one_are_named():
+    """Antagonistic tendons; three whose sum is constant; one that does not move."""
+    rng = np.random.default_rng(0)
+    free = rng.normal(size=(2000, 4))
+    assert moved_together(free) == ""
+    pairs = np.stack([free[:, 0], free[:, 1], 0.2 * free[:, 2] - free[:, 0], free[:, 1]], axis=1)
+    # Of a variance of 1.04, 0.04 is another signal's: r = -1 / sqrt(1.04).
+    assert moved_together(pairs) == (
+        "channels 1 and 3 move against each other (r = -0.98), "
+        "channels 2 and 4 move together (r = 1.00)"
+    )
+    apart = np.stack([free[:, 0], 0.5 * free[:, 1] - free[:, 0]], axis=1)
+    assert moved_together(apart) == "", "r = -1 / sqrt(1.25) = -0.89"
+    summed = np.stack([free[:, 0], free[:, 1], -free[:, 0] - free[:, 1]], axis=1)
+    assert moved_together(summed) == "each of channels 1, 2 and 3 follows from the others"
+    assert moved_together(np.column_stack([free[:, 0], np.ones(2000)])) == ""
+    assert moved_together(np.zeros((9, 3))) == moved_together(free[:, :1]) == ""

@@ -194,3 +194,13 @@ def test_a_fit_notes_recordings_of_less_than_two_minutes(pair):
     (note,) = short
     assert note.startswith(f"the recordings last {seconds:.0f} s in all, expected")
     assert long == []
+
+
+def test_a_fit_notes_channels_that_move_as_one():
+    some = recorded(1, rows=400)
+    actuation = some.measured.copy()
+    actuation[:, 1] = actuation[:, 0].max() - actuation[:, 0]
+    quick = {"effects": [], "hidden": (8,), "epochs": 1, "prior": "none"}
+    said = "channels 1 and 2 move against each other (r = -1.00): what each of them does alone"
+    for given, told in ((replace(some, measured=actuation), 1), (some, 0)):
+        assert sum(said in note for note in fit(given, **quick).warnings) == told

@@ -476,8 +476,8 @@ def diagnose(
             result = with_refit(result, joint, problem)
         if result.verdict.kind == "unknown_effect":
             result = with_axis(result, problem)
-        known = result.verdict.reason != "arm" and not problem.in_fit
-        if reference is None and known and faster_than_fit(model.spec, whole):
+        of_arm = reference is None and result.verdict.reason != "arm"
+        if of_arm and not problem.in_fit and faster_than_fit(model.spec, whole):
             report("what has changed since the fit")
             changed = changed_since_fit(table, without, (problem, tried))
             result = replace(result, since_fit=changed)

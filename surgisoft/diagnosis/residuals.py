@@ -748,7 +748,8 @@ class ModelFit:
         it."""
         if self.motion_mm <= NOTICED * self.expected_mm:
             return True
-        return left_mm <= max(LEFT_OF_MOTION * self.motion_mm, NOTICED * self.expected_mm)
+        most = max(LEFT_OF_MOTION * self.motion_mm, NOTICED * self.expected_mm)
+        return left_mm <= most
 
 
 def model_fit(table: ResidualTable) -> ModelFit | None:

@@ -252,7 +252,8 @@ def _clocks(role: FileRole, table: RawTable, t_s: np.ndarray) -> tuple[np.ndarra
         )
     if role.clock == "from_start":
         log_s, t_s = log_s - log_s[0], t_s - t_s[0]
-    return log_s + role.clock_offset_s, t_s
+    log_s = log_s + role.clock_offset_s
+    return log_s, t_s
 
 
 def _apart(spec: ImportMap, name: str, table: RawTable, main: RawTable, t_s: np.ndarray) -> str:

@@ -320,6 +320,7 @@ def test_amend_and_improve_write_nothing_where_nothing_is_claimed(
         claimed=False, rounds=rounds, steps=[("creep", 0.3)], parameters=[PARAMETER, UNITLESS],
         held_out=SimpleNamespace(before=0.5, floor=0.1, in_fit=0.0), model_error=None,
         sentence="no significant fall", in_words={"creep": "half of it after 3 s", "leak": ""},
+        diagnoses=(),
     )  # fmt: skip
     command = ["improve", "default", rec, "-o", new, "--json", numbers + ".json"]
     target = "surgisoft.diagnosis.improve.improve"

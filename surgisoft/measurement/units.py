@@ -15,6 +15,8 @@ _VOLTS_PER = {"V": 1.0, "mV": 1e-3}
 _NEWTONS_PER = {"N": 1.0, "mN": 1e-3, "kN": 1e3}
 ACTUATION_UNITS = (*KPA_PER, *_DEGREES_PER, *_VOLTS_PER, *_NEWTONS_PER)
 """Units of pressures, angles, voltages and forces."""
+PLURAL = {"in": "inches"}
+"""Units in words, where these differ from their letters."""
 _QUANTITIES = (KPA_PER, _DEGREES_PER, MM_PER, _VOLTS_PER, _NEWTONS_PER)
 _ALL = (*_QUANTITIES, SECONDS_PER)
 

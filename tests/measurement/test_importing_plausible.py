@@ -199,7 +199,7 @@ def test_a_command_that_is_held_between_the_rows_of_its_log_is_not_late():
     ("unit", "factor", "said"),
     [
         ("mm", 10.0, "times its command, as if one were in cm and the other in mm"),
-        ("mm", 1 / 25.4, "times its command, as if one were in in and the other in mm"),
+        ("mm", 1 / 25.4, "times its command, as if one were in inches and the other in mm"),
         ("kPa", 6.895, "times its command, as if one were in psi and the other in kPa"),
         ("mm", 3.3, None),
         ("kPa", 1.0, None),

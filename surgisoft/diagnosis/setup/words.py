@@ -10,14 +10,13 @@ from scipy.spatial.transform import Rotation
 from surgisoft.diagnosis.setup.alignment import Frame, angle
 from surgisoft.diagnosis.setup.sample import Arrangement
 from surgisoft.diagnosis.setup.search import LENGTH_MISTAKES, Fitted, Kind
+from surgisoft.measurement.units import PLURAL
 
 NEAR_AXIS_RAD = 0.1
 """An axis of rotation is named x, y or z up to this angle, rad."""
 LEAST_SHIFT_SD, LEAST_SHIFT_MM = 3.0, 0.5
 """Least shift of a turned frame that is reported as part of the fault: in standard errors, and in
 mm."""
-PLURAL = {"in": "inches"}
-"""Units in words, where these differ from their letters."""
 TIME_NAMES = {1e-3: "ms", 1e-6: "us"}
 """Names of units of time by their seconds."""
 

@@ -14,7 +14,7 @@ from surgisoft.measurement.recordings.clock import (
     usual_step_s,
 )
 from surgisoft.measurement.recordings.columns import MM_PER
-from surgisoft.measurement.units import SECONDS_PER, unit_mistakes
+from surgisoft.measurement.units import PLURAL, SECONDS_PER, unit_mistakes
 
 LARGEST_RATIO = 2.0
 """Key points that span more than this multiple of the arm's length are in a wrong unit."""
@@ -151,9 +151,10 @@ def _unit(recording: Recording, shifts: np.ndarray, own: np.ndarray) -> list[str
     ratios = measured / np.maximum(commanded, 1e-300)
     for units, by in unit_mistakes(recording.unit).items():
         if any((np.abs(ratios / factor - 1) <= SAME_RATIO).all() for factor in (by, 1 / by)):
+            one, other = (PLURAL.get(unit, unit) for unit in units)
             return [
                 f"measured actuation is {np.median(ratios):.3g} times its command, as if one were "
-                f"in {units[0]} and the other in {units[1]}: check unit and to in [measured] and "
+                f"in {one} and the other in {other}: check unit and to in [measured] and "
                 "[commanded] of the map"
             ]
     return []

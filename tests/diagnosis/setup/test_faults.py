@@ -215,3 +215,27 @@ def test_a_diagnosis_ends_with_the_set_up(model):
     assert plain["mending"] == plain["instructions"] == found.setup.instructions != ""
     assert plain["alternative_mendings"] == plain["alternative_instructions"] == []
     assert "114.6 deg about z" in found.verdict.sentence  # 2 rad
+
+
+@pytest.mark.parametrize(
+    ("by", "said"),
+    [
+        (10.0, "10 times too large: mm were read as cm"),
+        (0.1, "the actuation is in cm where mm is stated"),
+        (1 / 25.4, "the actuation is in inches where mm is stated"),
+        (2.54, "2.54 times too large: cm were read as inches and converted to mm"),
+        (1000.0, "1000 times too large: mm were read as m"),
+    ],
+)
+def test_tendons_in_another_unit_of_length_are_found(by, said):
+    """The default arm as if its actuation were displacements of tendons in mm."""
+    arm = default_arm()
+    tendons = arm.replace(spec=replace(arm.spec, unit="mm"))
+    right = replace(measured(), unit="mm")
+    wrong = replace(right, measured=by * right.measured)
+    found = find_setup_faults(tendons, [wrong])
+    assert found is not None
+    assert found.kinds == ("actuation_unit",)
+    assert said in found.sentence
+    (corrected,) = found.corrected([wrong])
+    np.testing.assert_allclose(corrected.measured, right.measured, rtol=1e-9)

@@ -193,13 +193,18 @@ def moved_together(actuation: np.ndarray) -> str:
     if len(live) < 2:
         return ""
     r = np.corrcoef(actuation[:, live].T)
-    parts = [
-        f"channels {live[i] + 1} and {live[j] + 1} move "
-        f"{'together' if r[i, j] > 0 else 'against each other'} (r = {r[i, j]:.2f})"
-        for i in range(len(live))
-        for j in range(i + 1, len(live))
-        if abs(r[i, j]) >= TOGETHER
-    ]
+    parts, seen = [], set[int]()
+    for i in range(len(live)):
+        like = np.flatnonzero(np.abs(r[i]) >= TOGETHER)
+        if i in seen or len(like) < 2:
+            continue
+        seen |= set(like.tolist())
+        first, last = ", ".join(map(str, live[like[:-1]] + 1)), live[like[-1]] + 1
+        each = r[i, like[1:]]
+        how = "together" if each.min() > 0 else "against each other"
+        how = how if len(like) == 2 else "together or against each other"
+        least = each[np.abs(each).argmin()]
+        parts.append(f"channels {first} and {last} move {how} (r = {least:.2f})")
     # 1 - R^2 of a channel on all others is one over its element of the inverse of all r.
     alone = 1.0 / np.diagonal(np.linalg.inv(r + 1e-6 * np.eye(len(live))))
     if not parts:

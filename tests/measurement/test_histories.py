@@ -125,6 +125,10 @@ def test_channels_that_move_as_one_are_named():
         "channels 1 and 3 move against each other (r = -0.98), "
         "channels 2 and 4 move together (r = 1.00)"
     )
+    all_four = free[:, :1] * [1.0, -1.0, 2.0, 1.0] + 0.2 * free[:, 1:2] * [0.0, 0.0, 0.0, 1.0]
+    assert moved_together(all_four) == (
+        "channels 1, 2, 3 and 4 move together or against each other (r = 0.98)"
+    )
     apart = np.stack([free[:, 0], 0.5 * free[:, 1] - free[:, 0]], axis=1)
     assert moved_together(apart) == "", "r = -1 / sqrt(1.25) = -0.89"
     summed = np.stack([free[:, 0], free[:, 1], -free[:, 0] - free[:, 1]], axis=1)

@@ -171,7 +171,9 @@ def fit(
             "--threads": None if threads == 1 else threads,
         }
         new = typed(f"{output}_with_effects")
-        again = f"surgisoft fit {typed_once(recordings)}{given_options(given)} --effects auto -o {new}"
+        again = (
+            f"surgisoft fit {typed_once(recordings)}{given_options(given)} --effects auto -o {new}"
+        )
         again = with_effect_files(again)
         print(f"next, whether the arm has memory that this model lacks: {again}")
     following = with_effect_files(

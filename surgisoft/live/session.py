@@ -933,8 +933,11 @@ def _rehearse(place: Task, policy: Policy) -> None:
 def _undisturbed() -> Iterator[None]:
     """Keep the interpreter's garbage collector and other threads from delaying the loop."""
     threads, interval = torch.get_num_threads(), sys.getswitchinterval()
+    # A caller that left its own objects alone goes on doing so: unfreezing frees them all.
+    frozen = gc.get_freeze_count() > 0
     gc.collect()
-    gc.freeze()
+    if not frozen:
+        gc.freeze()
     thresholds = gc.get_threshold()
     gc.set_threshold(*thresholds[:2], OLD_OBJECTS_KEPT)
     torch.set_num_threads(1)
@@ -945,7 +948,7 @@ def _undisturbed() -> Iterator[None]:
         sys.setswitchinterval(interval)
         torch.set_num_threads(threads)
         gc.set_threshold(*thresholds)
-        with suppress(AttributeError):
+        if not frozen:
             gc.unfreeze()
 
 

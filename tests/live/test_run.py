@@ -1,5 +1,6 @@
 """Runs on the virtual rig and on one that knows no truth: what is recorded, found, and vented."""
 
+import gc
 import json
 import os
 import signal
@@ -212,6 +213,21 @@ def test_the_rate_of_the_loop_may_differ_from_that_of_the_samples(schedule):
     slow = run("random", task="track_circle", rate_hz=10.0, minutes=0.12, **SIMULATED)
     moves = np.diff(slow.recording.commanded, axis=0).any(axis=1)
     assert not moves[82:-1:2].any() or not moves[83:-1:2].any(), "one command in two samples"
+
+
+def test_objects_that_the_caller_left_alone_are_left_alone_afterwards(schedule, monkeypatch):
+    """Those that Python does not search for cycles; where there were none, there are none."""
+    monkeypatch.setattr(gc, "collect", lambda *_: 0)  # half a second, for all that pytest holds
+    gc.freeze()
+    before = gc.get_freeze_count()
+    run(schedule, minutes=0.05, **SIMULATED)
+    kept = gc.get_freeze_count()
+    gc.unfreeze()
+    run(schedule, minutes=0.05, **SIMULATED)
+    free = gc.get_freeze_count()
+    gc.freeze()
+    assert 0.9 * before < kept <= before
+    assert free == 0
 
 
 def test_a_run_that_is_stopped_is_complete_and_vented(schedule, tmp_path):

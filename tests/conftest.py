@@ -59,6 +59,16 @@ def pytest_configure(config):
         sys.dont_write_bytecode = False
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Import tests and libraries without looking for cycles: what they make stays to the end."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
+
+
 def pytest_collection_modifyitems(items):
     """Mark each test `slow` or `fast`; put the files with the most processor time first."""
     slow = _slow()

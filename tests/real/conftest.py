@@ -19,9 +19,9 @@ def raw_folder(shared: Path, name: str) -> Path:
 
 @pytest.fixture(scope="session")
 def trunk(shared, tmp_path_factory):
-    """Recordings of the trunk at 25 Hz by their payload, g."""
+    """Recordings of the trunk at 12.5 Hz by their payload, g."""
     folder, out = raw_folder(shared, "asl_trunk_payload"), tmp_path_factory.mktemp("trunk")
-    (out / "map.toml").write_text((MAPS / "asl_trunk.toml").read_text() + "\n[rows]\nevery = 4\n")
+    (out / "map.toml").write_text((MAPS / "asl_trunk.toml").read_text() + "\n[rows]\nevery = 8\n")
     inputs, answer = folder / "control_inputs_controlled_1.csv", {}
     for payload, name in ((0, ""), (100, "_100g")):
         answer[payload] = out / f"trunk{payload}.parquet"
@@ -33,7 +33,7 @@ def trunk(shared, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def two_segments(shared, tmp_path_factory):
-    """The recording of the arm of two segments: the six runs of January, every tenth row.
+    """The recording of the arm of two segments: the six runs of January, every 20th row.
 
     In the later ones the motion capture is slower than the log, and most positions repeat.
     """
@@ -41,6 +41,6 @@ def two_segments(shared, tmp_path_factory):
     files = [str(path) for path in sorted(folder.glob("Jan_*.txt.gz"))]
     assert len(files) == 6
     target, every = out / "arm.parquet", (MAPS / "asu_two_segment.toml").read_text()
-    (out / "map.toml").write_text(every.replace("[rows]\n", "[rows]\nevery = 10\n"))
+    (out / "map.toml").write_text(every.replace("[rows]\n", "[rows]\nevery = 20\n"))
     assert run(["import", *files, "--map", str(out / "map.toml"), "-o", str(target)]) == 0
     return target

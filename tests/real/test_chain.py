@@ -9,8 +9,8 @@ from surgisoft.diagnosis.refit import RefitConfig
 from surgisoft.diagnosis.refit import refit as fitted_together
 
 SMALL = ["--widths", "32,32", "--inputs", "pressure", "--epochs", "30"]
-BRIEF = RefitConfig(rows=2000, seeds=2, early_epochs=1, first_epochs=4, epochs=15, finalists=2)
-"""The budget of a refit: about a sixth of that of the commands."""
+BRIEF = RefitConfig(rows=2000, seeds=2, early_epochs=1, first_epochs=2, epochs=6, finalists=2)
+"""The budget of a refit: about a fifteenth of that of the commands."""
 
 
 def diagnosis(monkeypatch, recording, tmp_path, *options, of=None, refit="auto"):

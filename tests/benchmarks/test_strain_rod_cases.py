@@ -526,7 +526,7 @@ def test_every_effect_changes_the_motion_and_nothing_else_does():
     """Without any the motion is equal to the last bit. What is in front of the sensors stays as it
     is, and the sensors show chambers that only lines and valves may change."""
     rig = StrainRodRig(901, noise=0.0)
-    protocol = rig_cases.excitation(rig, "tried", ("steps", "sets", "wander"), 60.0, 901)
+    protocol = rig_cases.excitation(rig, "tried", ("steps", "sets", "wander"), 30.0, 901)
     recording, truth = rig.record(protocol)
     plain, chambers = truth.noise_free_mm, truth.pressures_kPa
     again = StrainRodRig(901, noise=0.0).record(protocol)[1].noise_free_mm

@@ -89,26 +89,43 @@ def limited(call, path, size: int = 300) -> str:
     return said if os.waitpid(pid, 0)[1] == 0 else "its process was ended"
 
 
-def limited_alone(writer, path, *sizes):
-    """As `limited` for each size, in a new process: Rerun's threads do not survive a fork."""
+@pytest.fixture(scope="module")
+def limited_alone(tmp_path_factory):
+    """As `limited` for each writer of replays and size, in a new process: Rerun's threads do not
+    survive a fork. What it says of each writer, and the folder of the writer's file."""
+    place = tmp_path_factory.mktemp("alone")
     code = f"""
-import resource, sys
+import resource
 from pathlib import Path
 from surgisoft.errors import InputError
 from tests import replay_writers
-for size in sys.argv[2:]:
-    hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
-    resource.setrlimit(resource.RLIMIT_FSIZE, (int(size), hard))
-    try:
-        replay_writers.{writer}(Path(sys.argv[1]))
-        said = "written"
-    except (InputError, OSError) as error:
-        said = "one line, " + str("File too large" in str(error))
-    print("result:", said, Path(sys.argv[1]).stat().st_size, file=sys.stderr)
+for writer, sizes in {REPLAYS!r}.items():
+    path = Path({str(place)!r}) / writer / "a.rrd"
+    path.parent.mkdir()
+    path.write_text("old")
+    for size in sizes:
+        hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+        try:
+            getattr(replay_writers, writer)(path)
+            said = "written"
+        except (InputError, OSError) as error:
+            said = "one line, " + str("File too large" in str(error))
+        print("result:", writer, said, path.stat().st_size)
 """
-    command = [sys.executable, "-c", code, str(path), *map(str, sizes)]
-    lines = subprocess.run(command, capture_output=True, text=True, timeout=60).stderr.split("\n")
-    return [line.removeprefix("result: ") for line in lines if line.startswith("result: ")]
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    lines = [line.partition(" ")[2] for line in done.stdout.splitlines() if "result: " in line]
+
+    def found(writer):
+        said = [line.removeprefix(f"{writer} ") for line in lines if line.startswith(f"{writer} ")]
+        assert len(said) == 2, done.stderr
+        return said, place / writer
+
+    return found
+
+
+REPLAYS = {"a_replay": (300, 1 << 30), "a_live_view": (0, 1 << 30)}
+"""Writers of `tests.replay_writers`, and the most bytes of a file in two calls of each."""
 
 
 def a_graph(path):
@@ -137,24 +154,20 @@ def test_a_write_that_ends_in_the_middle_leaves_the_old_file(tmp_path, name):
     assert path.stat().st_size > 300
 
 
-def test_a_replay_that_ends_in_the_middle_leaves_the_old_file(tmp_path):
-    path = tmp_path / "a.rrd"
-    path.write_text("old")
-    said = limited_alone("a_replay", path, 300, 1 << 30)
+def test_a_replay_that_ends_in_the_middle_leaves_the_old_file(limited_alone):
+    said, folder = limited_alone("a_replay")
     assert said[0] == "one line, True 3"
     assert said[1].startswith("written ")
-    assert path.stat().st_size > 300
-    assert [file.name for file in tmp_path.iterdir()] == ["a.rrd"]
+    assert int(said[1].split()[1]) > 300
+    assert [file.name for file in folder.iterdir()] == ["a.rrd"]
 
 
-def test_a_live_view_ends_where_its_file_cannot_be_written(tmp_path):
-    path = tmp_path / "a.rrd"
-    path.write_text("old")
-    said = limited_alone("a_live_view", path, 0, 1 << 30)
+def test_a_live_view_ends_where_its_file_cannot_be_written(limited_alone):
+    said, _ = limited_alone("a_live_view")
     assert said[0].startswith("one line")
     assert said[0].endswith(" 3"), "the old file"
     assert said[1].startswith("written ")
-    assert path.stat().st_size > 300
+    assert int(said[1].split()[1]) > 300
 
 
 @pytest.mark.skipif(getattr(os, "geteuid", lambda: 1)() == 0, reason="root may write everywhere")

@@ -6,6 +6,7 @@ for each parameter. The package's rigs are in `RIGS`. Another package offers one
 group `surgisoft.rigs`; any other callable is named as `package.module:object`.
 """
 
+import functools
 import importlib
 import importlib.util
 import inspect
@@ -371,6 +372,13 @@ def safety_options() -> dict[str, RigOption]:
 
 
 def _offered() -> dict[str, EntryPoint]:
+    """Entry points of rigs in installed packages by name; none is loaded."""
+    return _entries(tuple(sys.path))
+
+
+@functools.cache
+def _entries(path: tuple[str, ...]) -> dict[str, EntryPoint]:
+    """Those while the search path is this one: reading them takes 5 ms."""
     return {entry.name: entry for entry in entry_points(group=GROUP)}
 
 

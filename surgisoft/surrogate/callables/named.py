@@ -5,13 +5,14 @@ in the entry point group `surgisoft.models`. A model folder that holds one state
 refused until the user has named it, too.
 """
 
+import functools
 import hashlib
 import importlib
 import importlib.util
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -46,8 +47,14 @@ NAMED: dict[str, Named] = {}
 """Callables that the user has named, by name."""
 
 
-def offered() -> dict[str, Any]:
+def offered() -> dict[str, EntryPoint]:
     """Entry points of callable models in installed packages by name; none is loaded."""
+    return _offered(tuple(sys.path))
+
+
+@functools.cache
+def _offered(path: tuple[str, ...]) -> dict[str, EntryPoint]:
+    """Those while the search path is this one: reading them takes 5 ms."""
     return {entry.name: entry for entry in entry_points(group=GROUP)}
 
 

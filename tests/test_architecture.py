@@ -1,6 +1,8 @@
 """Imports run one way, and each outside library is spoken to in one place."""
 
 import ast
+import re
+from collections.abc import Collection
 from functools import cache
 from pathlib import Path
 
@@ -300,6 +302,11 @@ UNIX_NAMES = {
 """Names of `mmap`, `os` and `signal` that Windows lacks."""
 
 
+def words_of(source: str, words: Collection[str]) -> bool:
+    """Whether a source has one of these words at all: most have none, and need no parsing."""
+    return re.search(rf"\b(?:{'|'.join(words)})\b", source) is not None
+
+
 def on_import(node: ast.AST):
     """Nodes of a module that run when it is imported: all but the bodies of its functions."""
     for child in ast.iter_child_nodes(node):
@@ -313,6 +320,8 @@ def on_import(node: ast.AST):
 
 def unix_only(source: str) -> list[str]:
     """What a module needs on its import that Windows lacks."""
+    if not words_of(source, UNIX_ONLY | UNIX_NAMES):
+        return []
     found = []
     for node in on_import(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -330,6 +339,8 @@ GUARDS = ("sys.platform", "os.name", "hasattr(", "ImportError", "AttributeError"
 
 def unguarded(source: str) -> list[str]:
     """Names that Windows lacks, anywhere in a module that does not ask for the system."""
+    if any(guard in source for guard in GUARDS) or not words_of(source, UNIX_NAMES):
+        return []
     return [
         f"{node.value.id}.{node.attr}"
         for node in ast.walk(ast.parse(source))
@@ -337,7 +348,6 @@ def unguarded(source: str) -> list[str]:
         and isinstance(node.value, ast.Name)
         and node.value.id in ("mmap", "os", "signal")
         and node.attr in UNIX_NAMES
-        and not any(guard in source for guard in GUARDS)
     ]
 
 
@@ -367,6 +377,8 @@ OF_LIBRARIES = ("_replace", "_repr_html_", "_exit", "_protected_args")
 
 def private_names(source: str) -> list[str]:
     """Names that begin with an underscore, are of something imported, and occur in a test."""
+    if not re.search(r"\b_[^\W_]", source):
+        return []
     found = []
     for node in ast.walk(ast.parse(source)):
         match node:
@@ -398,6 +410,8 @@ OTHER_MEANING = {"tasks": {"contact"}, "experiments": {"contact"}}
 
 def effects_named_in(path: Path, text: str) -> set[str]:
     """Effects whose names stand in a module as texts, or whose modules it imports."""
+    if not words_of(text, EFFECTS):
+        return set()
     found = set()
     for node in ast.walk(ast.parse(text)):
         match node:

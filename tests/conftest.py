@@ -49,7 +49,7 @@ def pytest_addoption(parser):
 
 def pytest_configure(config):
     """Keep bytecode, whatever the environment says: without it each worker and each process that a
-    test starts compiles every module anew, two minutes of processor time in a run of the suite.
+    test starts compiles every module anew, about a minute of processor time in a run of the suite.
 
     A run that keeps no cache (`-p no:cacheprovider`) keeps none: its source may change within a
     second, as that of mutants does.

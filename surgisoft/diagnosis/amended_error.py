@@ -24,12 +24,13 @@ def state_residuals(model: ArmModel, given: ArmModel, retuned: bool = False) -> 
     """Set the residuals of an amended model on the rows of the given model's fit.
 
     Where those of the amended model are not smaller, or are not known because the given model does
-    not keep the actuation before these rows, they are those of the given model, or None where the
-    network was re-tuned since.
+    not keep the actuation before these rows, or where its runs begin, they are those of the given
+    model, or None where the network was re-tuned since.
     """
     known = given.training_residuals
     model.training_residuals = None if retuned else known
-    if known is None or known.past is None or not len(known.past.row):
+    past = None if known is None else known.past
+    if known is None or past is None or past.stood is None or not len(past.row):
         return
     residual = _residuals_mm(model, given, known)
     if residual.square().nansum() < known.residual_mm.square().nansum():
@@ -82,12 +83,7 @@ def _residuals_mm(model: ArmModel, given: ArmModel, known: TrainingResiduals) ->
     runs = torch.unique_consecutive(past.run, return_counts=True)[1].tolist()
     t_s, actuation = list(past.t_s.split(runs)), list(past.actuation.split(runs))
     nowhere = [torch.full((count, model.spec.key_points, 3), torch.nan) for count in runs]
-    stood = None
-    if model.spec.actuation == "measured":
-        # As `history_of` has it: a continuous run begins where its first actuation says.
-        nan = torch.full((model.spec.chambers,), torch.nan)
-        continuous = [bool(time[-1] > time[0]) for time in t_s]
-        stood = [run[0] if on else nan for run, on in zip(actuation, continuous, strict=True)]
+    stood = None if past.stood is None else list(past.stood)
     history = pack(t_s, actuation, nowhere, stood=stood)
     was, now = (history.rows(each.predict(history))[past.row] for each in (given, model))
     return known.residual_mm + (was - now)

@@ -152,8 +152,7 @@ def find_jumps(motion: Motion) -> Jumps:
     size, near, there = (np.concatenate([each[k] for each in theirs]) for k in range(3))
     measured = np.concatenate(found)
     moments = np.concatenate([rows[side : len(rows) - side + 1] for rows in parts])
-    longest = LONGEST_STEP * float(np.quantile(steps, USUAL_STEPS))
-    even = np.concatenate([_even(t_s[rows], side, longest) for rows in parts])
+    even = np.concatenate([_even(t_s[rows], side) for rows in parts])
     # A filter of the motion before the first row is not known.
     whole = np.isfinite(measured).all(1) & even & np.concatenate([each[3] for each in theirs])
     energy = _unexplained(np.where(whole[:, None], measured, 0.0), there, near, whole)
@@ -211,9 +210,11 @@ def _jumps(values: np.ndarray, side: int, degree: int = 1) -> np.ndarray:
     return answer
 
 
-def _even(t_s: np.ndarray, side: int, longest_s: float) -> np.ndarray:
+def _even(t_s: np.ndarray, side: int) -> np.ndarray:
     """(T - 2 side + 1,) whether no row is missing within both sides of each moment of a run."""
-    before = np.concatenate([[0], np.cumsum(np.diff(t_s) > longest_s)])
+    steps = np.diff(t_s)
+    longest = LONGEST_STEP * float(np.quantile(steps, USUAL_STEPS))
+    before = np.concatenate([[0], np.cumsum(steps > longest)])
     return before[2 * side - 1 :] == before[: len(before) - 2 * side + 1]
 
 

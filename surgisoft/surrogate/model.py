@@ -155,12 +155,13 @@ class ArmModel(nn.Module):
     @torch.no_grad()
     def residuals_on(self, histories: Iterable[History], rows: int = ROWS) -> TrainingResiduals:
         """Residuals of this model on at most `rows` measured rows of histories, evenly thinned."""
-        parts, runs = [], 0
+        parts, runs, begun = [], 0, []
         for history in histories:
             residual = history.rows(history.key_points - self.predict(history))
             direction = history.rows(self.trace(history).direction)
             run = history.run_of_row + runs
             runs += history.runs
+            begun.append(history.stood)
             given = history.rows(history.t_s), history.rows(history.pressure)
             parts.append((*given, run, direction, residual))
         t_s, actuation, run, direction, residual = map(torch.cat, zip(*parts, strict=True))
@@ -170,11 +171,15 @@ class ArmModel(nn.Module):
         every = torch.arange(0, len(t_s), thin, device=t_s.device)
         kept = torch.cat([every, chosen]).unique()
         row = torch.searchsorted(kept, chosen)
+        known = [each for each in begun if each is not None]
+        # Of a history with more rows than are kept, a run of few rows may have none.
+        named = run[kept].unique()
+        stood = torch.cat(known)[named].float() if len(known) == len(begun) else None
         return TrainingResiduals(
             actuation=actuation[chosen].float(),
             direction=direction[chosen].float(),
             residual_mm=residual[chosen].float(),
-            past=Past(t_s[kept], actuation[kept].float(), run[kept].int(), row.int()),
+            past=Past(t_s[kept], actuation[kept].float(), run[kept].int(), row.int(), stood),
         )
 
     @property

@@ -9,6 +9,7 @@ Kennedy & O'Hagan 2001).
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
 from safetensors.torch import load_file, save
 from torch import Tensor
 
@@ -35,6 +36,9 @@ class Past:
     """(K,) number of the run, ascending."""
     row: Tensor
     """(S,) place of each row of the residuals among the K."""
+    stood: Tensor | None = None
+    """(R, m) where each run begins (`History.stood`), NaN where at rest; None for models that were
+    fitted before it was kept."""
 
     def check(self, rows: int, chambers: int) -> None:
         """Raise ValueError unless it can be the past of S rows of m chambers."""
@@ -47,6 +51,9 @@ class Past:
         same = self.run.diff() == 0
         if (self.run.diff() < 0).any() or (self.t_s.diff()[same] < 0).any():
             raise ValueError("its actuation over time is not in order")
+        runs = len(torch.unique_consecutive(self.run))
+        if self.stood is not None and self.stood.shape != (runs, chambers):
+            raise ValueError("it does not say of each run where it begins")
         if rows and not 0 <= int(self.row.min()) <= int(self.row.max()) < count:
             raise ValueError("its rows are not among those of the actuation over time")
 
@@ -68,7 +75,8 @@ class TrainingResiduals:
         """Write the residuals into a model's folder."""
         arrays = {name: value for name, value in vars(self).items() if name != "past"}
         if self.past is not None:
-            arrays |= {f"{PAST}{name}": value for name, value in vars(self.past).items()}
+            past = {name: value for name, value in vars(self.past).items() if value is not None}
+            arrays |= {f"{PAST}{name}": value for name, value in past.items()}
         (folder / FILE).write_bytes(save(arrays))
 
     @classmethod

@@ -9,6 +9,7 @@ import torch
 from surgisoft.diagnosis.amend import amend
 from surgisoft.diagnosis.improve import improve
 from surgisoft.measurement.histories import history_of
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.training import validated_error
@@ -17,14 +18,27 @@ from tests.diagnosis.test_estimation import NOISE_MM, TRUTHS, bare_arm, measured
 FLOOR_MM = np.sqrt(3.0) * NOISE_MM
 
 
-def fitted_to(truth: ArmModel) -> ArmModel:
+def fitted_to(truth: ArmModel, arm: ArmModel | None = None, kind: str = "continuous") -> ArmModel:
     """The bare arm as if `truth`, which has an effect more, had been recorded for its fit."""
-    arm = bare_arm()
-    of_fit, validation = (history_of([measured_on(truth, seed=seed)]) for seed in (7, 8))
+    arm = arm or bare_arm()
+    of_fit, validation = (
+        history_of([of(truth, seed, kind)], arm.spec.actuation) for seed in (7, 8)
+    )
     arm.training_residuals = arm.residuals_on([of_fit])
     pair = (validation.rows(x) for x in (validation.key_points, arm.predict(validation)))
     arm.validation = replace(validated_error(*pair), noise_mm=NOISE_MM)
     return arm
+
+
+def of(truth: ArmModel, seed: int, kind: str) -> Recording:
+    """A recording of an arm whose runs begin away from rest; the commands are the pressures."""
+    plain = replace(measured_on(truth, seed=seed), kind=kind)
+    plain = replace(plain, commanded=plain.measured.copy())
+    history = history_of([plain], truth.spec.actuation)
+    with torch.no_grad():
+        points = history.rows(truth.predict(history)).double().numpy()
+    noise = np.random.default_rng(seed).normal(0.0, NOISE_MM, points.shape)
+    return replace(plain, key_points_mm=points + noise)
 
 
 @pytest.mark.parametrize("step", ["amend", "improve"])
@@ -45,13 +59,29 @@ def test_an_effect_that_the_fit_lacked_takes_its_part_of_the_stated_error_away(s
     pairs = zip(error.per_key_point_mm, stated.per_key_point_mm, strict=True)
     assert all(now <= was for now, was in pairs)
     # Its residuals of the fit are those that it would have had there.
-    direct = found.model.residuals_on([history_of([measured_on(truth, seed=7)])])
+    direct = found.model.residuals_on([history_of([of(truth, 7, "continuous")])])
     kept = found.model.training_residuals
     assert torch.allclose(kept.residual_mm, direct.residual_mm, atol=2e-4)
     assert kept.actuation.equal(arm.training_residuals.actuation)
     # The given model stays as it is.
     assert arm.validation == stated
     assert arm.training_residuals.residual_mm.square().mean() > 2 * kept.residual_mm.square().mean()
+
+
+@pytest.mark.parametrize(
+    ("actuation", "kind"), [("commanded", "continuous"), ("measured", "settled")]
+)
+def test_runs_of_the_fit_begin_where_they_began(actuation, kind):
+    """By commands as by measured pressures; steady-state points begin at rest."""
+    arm, truth = bare_arm(), TRUTHS["creep"]
+    spec = replace(arm.spec, actuation=actuation)
+    arm, truth = arm.replace(spec=spec), truth.replace(spec=spec)
+    arm = fitted_to(truth, arm, kind)
+    found = amend(arm, [of(truth, 1, "continuous")], "creep", refit="never", retune_network=False)
+    assert found.claimed
+    direct = found.model.residuals_on([history_of([of(truth, 7, kind)], actuation)])
+    kept = found.model.training_residuals
+    assert torch.allclose(kept.residual_mm, direct.residual_mm, atol=2e-4)
 
 
 def test_an_arm_that_changed_since_the_fit_leaves_the_stated_error_as_it_is():
@@ -82,10 +112,12 @@ def test_no_key_point_states_less_than_its_error_on_the_held_out_rows():
 
 def test_without_the_actuation_before_its_rows_nothing_is_restated():
     arm = fitted_to(TRUTHS["creep"])
-    arm.training_residuals = replace(arm.training_residuals, past=None)
-    found = amend(arm, [measured_on(TRUTHS["creep"], seed=1)], "creep", refit="never")
-    assert found.claimed
-    assert found.model.validation.rmse_mm == arm.validation.rmse_mm
+    known = arm.training_residuals
+    for past in (None, replace(known.past, stood=None)):
+        arm.training_residuals = replace(known, past=past)
+        found = amend(arm, [measured_on(TRUTHS["creep"], seed=1)], "creep", refit="never")
+        assert found.claimed
+        assert found.model.validation.rmse_mm == arm.validation.rmse_mm
 
 
 def test_what_is_restated_is_kept_in_the_folder(tmp_path):

@@ -176,6 +176,17 @@ def test_a_dropped_frame_is_none():
     assert found.rows.tolist() == [1496]
 
 
+def test_a_slower_run_beside_a_faster_one_keeps_its_jumps():
+    """A run at 20 Hz behind a longer one at 100 Hz: none of its rows is missing."""
+    run = np.where(np.arange(ROWS) >= 1400, 1, 0)
+    time = np.where(run == 0, 0.01 * np.arange(ROWS), STEP_S * (np.arange(ROWS) - 1400))
+    own, points = smooth_motion()
+    measured = points + noise()
+    measured[1700:] += 2.0
+    found = find_jumps(Motion(time, run, measured, points, own, NOISE))
+    assert found.rows.tolist() == [1700]
+
+
 def test_a_run_that_begins_elsewhere_is_no_jump():
     points, run = smooth_motion()[1] + noise(), np.where(TIME >= 50.0, 1, 0)
     points[run == 1] += 5.0

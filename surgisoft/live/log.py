@@ -37,6 +37,7 @@ class RunLog:
         self.rig, self.path, self.force, self.note = rig, None, force, note
         self.samples: list[Sample] = []
         self.runs: list[int] = []
+        self._kept: tuple[tuple[Sample, int], ...] = ()
         self._writer: RecordingLog | None = None
         self._open = ExitStack()
         if path is None:
@@ -59,8 +60,8 @@ class RunLog:
         )
         self._writer = self._open.enter_context(recording_log(self.growing, header, force))
 
-    def write(self, sample: Sample, run: int) -> None:
-        """Append a sample of a run."""
+    def write(self, sample: Sample, run: int) -> bool:
+        """Append a sample of a run; whether a recording can have it (`usable`)."""
         self.samples.append(sample)
         self.runs.append(run)
         if self._writer is not None:
@@ -73,20 +74,15 @@ class RunLog:
                 sample.commanded,
                 sample.temp_C,
             )
+        usable = bool(_usable([*self._kept, (sample, run)])[-1])
+        if usable:
+            self._kept = ((sample, run),)
+        return usable
 
     @property
     def usable(self) -> np.ndarray:
         """(T,) bool: the samples so far that a recording can have."""
-        count = min(len(self.samples), len(self.runs))
-        if count == 0:
-            return np.zeros(0, bool)
-        samples = self.samples[:count]
-        return usable_samples(
-            np.array([sample.t_s for sample in samples]),
-            np.array(self.runs[:count], np.int64),
-            np.array([sample.measured for sample in samples]),
-            np.array([sample.commanded for sample in samples]),
-        )
+        return _usable(list(zip(self.samples, self.runs, strict=False)))
 
     def recording(self, name: str, alarm: AlarmInfo | None = None) -> Recording:
         """The samples so far as a recording; alarm: the first one of the run.
@@ -148,3 +144,15 @@ class RunLog:
         self.close()
         if self.path is not None:
             self.growing.unlink(missing_ok=True)
+
+
+def _usable(samples: list[tuple[Sample, int]]) -> np.ndarray:
+    """(T,) bool: which of these samples with the runs they belong to a recording can have."""
+    if not samples:
+        return np.zeros(0, bool)
+    return usable_samples(
+        np.array([sample.t_s for sample, _ in samples]),
+        np.array([run for _, run in samples], np.int64),
+        np.array([sample.measured for sample, _ in samples]),
+        np.array([sample.commanded for sample, _ in samples]),
+    )

@@ -155,13 +155,14 @@ class WatchedRig:
             raise Finished
 
     def flush(self) -> None:
-        """Log, predict and report the last sample; one without every pressure is not reported."""
+        """Log, predict and report the last sample; one that no recording can have is not reported
+        (`RunLog.usable`)."""
         sample, self._pending = self._pending, None
         if sample is None:
             return
-        self.log.write(sample, self._run)
+        usable = self.log.write(sample, self._run)
         now = Instant(self.elapsed_s, sample, self.companion.predict(sample), self._run)
-        if not np.isfinite(sample.measured).all():
+        if not usable:
             return
         for watch in self.watchers:
             watch(now)

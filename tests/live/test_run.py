@@ -295,6 +295,42 @@ def test_a_sensor_that_is_silent_for_a_moment_costs_its_samples(schedule):
     assert found.rms_mm(begin_s=12.0) == pytest.approx(whole.rms_mm(begin_s=12.0), rel=0.02)
 
 
+class Repeating(Real):
+    """A real rig whose clock stands still in reads 200 to 219."""
+
+    def read(self):
+        found = super().read()
+        if 200 <= self.reads < 220:
+            return replace(found, t_s=self.last_s)
+        self.last_s = found.t_s
+        return found
+
+
+def test_a_clock_that_repeats_a_time_costs_the_samples_and_their_predictions(schedule):
+    """Predictions and alarm levels stay beside their rows, and the model's error is as before.
+
+    The first alarm level is that of the end of the reference.
+    """
+    warnings = []
+    found, whole = (
+        run(schedule, rig, minutes=0.6, reference_s=32.0, on_warning=warnings.append)
+        for rig in (Repeating(), Real())
+    )
+    assert [line for line in warnings if "left out" in line] == [
+        "20 samples left out: without a pressure, or with a time that is not later than the one "
+        "before"
+    ]
+    recording = found.recording
+    assert recording.samples == whole.recording.samples - 20
+    assert len(found.predicted_mm) == len(found.statistic) == recording.samples
+    rows = np.isin(whole.recording.t_s.round(6), recording.t_s.round(6))
+    assert rows.sum() == recording.samples
+    np.testing.assert_array_equal(np.isfinite(found.statistic), recording.t_s >= 32.0)
+    apart = np.linalg.norm(found.predicted_mm - whole.predicted_mm[rows], axis=-1)
+    assert apart.max() < 0.05
+    assert found.rms_mm(begin_s=12.0) == pytest.approx(whole.rms_mm(begin_s=12.0), rel=0.02)
+
+
 def test_a_policy_goes_on_where_a_sensor_is_silent_for_a_moment():
     config = TrackConfig(follow=FollowConfig(loop_s=4.0))
     warnings = []

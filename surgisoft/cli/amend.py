@@ -159,11 +159,10 @@ def amend(
     if saved:
         print(f"wrote {output}: {result.model.summary()}")
         files = typed_once(data)
-        same = model_options(None, model_error)
-        same += given_options({"--refit": None if refit == "auto" else refit})
+        same = given_options({"--refit": None if refit == "auto" else refit})
         following = f"surgisoft diagnose {typed(output)} {files}{same}"
         if before:
-            same = before_options(before, paired) + same
+            same = before_options(before, paired) + model_options(None, model_error) + same
             following = f"surgisoft improve {typed(model)} {files}{same} -o OTHER"
         print(f"next, find further effects: {with_effect_files(following)}")
     else:

@@ -157,7 +157,9 @@ def improve(
             "--max-effects": None if most == MOST else most,
             "--refit": None if refit == "auto" else refit,
         }
-        options = before_options(before, paired) + model_options(None, model_error)
+        options = ""
+        if before:
+            options = before_options(before, paired) + model_options(None, model_error)
         options += given_options(same)
         again = f"surgisoft improve {start} {files}{options} -o OTHER"
         following = with_effect_files(again)

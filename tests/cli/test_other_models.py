@@ -16,7 +16,8 @@ from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import load_recording, save_recording
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.callables import named
-from tests.cli.test_printed import diagnosis
+from surgisoft.surrogate.checkpoint import load_model
+from tests.cli.test_printed import diagnosis, result
 from tests.replay.reading import entities
 from tests.test_your_model import blocks
 
@@ -160,6 +161,42 @@ def test_an_amended_callable_is_a_model_folder(capsys, tmp_path):
     assert run(evaluate) == 2
     assert run([*evaluate, *code]) == 0
     assert run([*f"compare {new} bench.parquet".split(), *code]) == 0
+
+
+def test_what_follows_an_amended_callable_runs_as_it_is_printed(capsys, tmp_path, monkeypatch):
+    """The new folder states its validated error, which then is no option of the command."""
+    new, other, rec = tmp_path / "amended", tmp_path / "improved", "bench.parquet"
+    given = f"--model-error 1.25 --refit never -o {new}"
+    amend = f"amend my_arm.py:arm --effect payload --data {rec} --anyway {given}"
+    assert run(amend.split()) in (0, 1)
+    line = capsys.readouterr().out.splitlines()[-1]
+    code = "--model-code my_arm.py:arm"
+    assert line.endswith(f": surgisoft diagnose {new} {rec} --refit never {code}")
+    named.NAMED.clear()
+    assert run(line.partition(": surgisoft ")[2].split()) == 0
+    ended = result(
+        claimed=True, interrupted=True, rounds=[], steps=[], diagnoses=[], sentence="less",
+        model=load_model(new, model_code=["my_arm.py:arm"]),
+    )  # fmt: skip
+    monkeypatch.setattr("surgisoft.diagnosis.improve.improve", lambda *_, **__: ended)
+    improve = f"improve my_arm.py:arm {rec} --model-error 1.25 --refit never -o {other}"
+    capsys.readouterr()
+    for more, start in (("", other), (f" --before {rec} --force", "my_arm.py:arm")):
+        assert run((improve + more).split()) == 130
+        line = capsys.readouterr().out.splitlines()[-1]
+        words = line.partition(": surgisoft ")[2].split()
+        assert words[:3] == ["improve", str(start), rec]
+        opened = []
+
+        def keep(model, measured, *_, error_mm=None, kept=opened, **__):
+            kept.append(open_model(model, measured, None, None, error_mm))
+            raise InputError("opened")
+
+        with monkeypatch.context() as patch:
+            patch.setattr("surgisoft.diagnosis.improve.improve", keep)
+            assert run(words) == 2
+        assert capsys.readouterr().err == "surgisoft: error: opened\n"
+        assert opened[0].model.validation.rmse_mm == 1.25, "the folder states it, or the option"
 
 
 PLAN, AMEND = "next-experiment MODEL REC --between creep payload", "amend MODEL --data REC"

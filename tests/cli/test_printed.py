@@ -899,7 +899,7 @@ def test_after_an_amendment_the_advice_keeps_what_is_known_of_the_model(
         assert run(command) == 0
         return words_of(capsys.readouterr().out.splitlines()[-1])
 
-    assert last() == ["surgisoft", "diagnose", new, spaced, *given]
+    assert last() == ["surgisoft", "diagnose", new, spaced, *given[2:]]
     assert last("--before", spaced) == [
         "surgisoft", "improve", "default", spaced, "--before", spaced, *given, "-o", "OTHER",
     ]  # fmt: skip

@@ -336,6 +336,23 @@ def test_a_network_is_retuned_only_where_held_out_motion_rewards_it():
     assert rms(after.residual) < 1.1 * np.sqrt(3) * NOISE_MM < 0.7 * rms(held_out.residual)
 
 
+def test_a_network_is_retuned_where_one_key_point_is_never_seen():
+    """The key points that are seen become right; the layer of the other one stays as it is."""
+    arm = bare_arm()
+    whole = measured_on(arm)
+    lost = replace(whole, key_points_mm=whole.key_points_mm.copy())
+    lost.key_points_mm[:, -1] = np.nan
+    off = copy.deepcopy(arm)
+    off.network.layers[-1].bias += 0.02
+    found = retune(off, problem_of(off, [lost], part="training"))
+    assert found.kept
+    before = problem_of(off, [whole], part="held_out")
+    after = before.with_model(found.model)
+    np.testing.assert_allclose(after.residual[:, -1], before.residual[:, -1], atol=1e-5)
+    after_mm, before_mm = rms(after.residual[:, :-1]), rms(before.residual[:, :-1])
+    assert after_mm < 1.1 * np.sqrt(3) * NOISE_MM < 0.8 * before_mm
+
+
 def test_a_layer_that_makes_left_out_quarters_worse_is_not_kept():
     """An arm whose base stands 1 mm aside for the first three fifths of the training rows.
 

@@ -168,13 +168,15 @@ def _ridge(
     hidden: np.ndarray, residual: np.ndarray, held: np.ndarray, ridges: np.ndarray
 ) -> np.ndarray:
     """(R, H + 1, 3n) change of the layer for each ridge (R,); a row with a missing key point does
-    not count for it."""
+    not count for it, and the layer of one that is never seen does not change."""
     answer = np.zeros((len(ridges), hidden.shape[1], residual.shape[1]))
     known: dict[bytes, list[int]] = {}
     for k in range(residual.shape[1]):
         known.setdefault(np.isfinite(residual[:, k]).tobytes(), []).append(k)
     for columns in known.values():
         seen = np.isfinite(residual[:, columns[0]])
+        if not seen.any():
+            continue
         inside = hidden[seen]
         normal, right = inside.T @ inside, inside.T @ residual[seen][:, columns]
         for change, ridge in zip(answer, ridges, strict=True):

@@ -40,8 +40,8 @@ warm = np.array([float(row.get("temp_C") or "nan") for row in rows])
 steps = np.where(begins, 0.0, np.diff(time, prepend=time[0]))
 for now, dt, temperature, begin, since in zip(pressure, steps, warm, begins, time, strict=True):
     if begin:
-        state = np.array(start(now[None])[0])
-        state[:, about["state"]["elapsed"]] = since  # a drift follows the recording's own time
+        state = np.asarray(start(now[None])[0]).copy()
+        state[:, about["state"].get("elapsed", [])] = since  # for a drift: the recording's own time
     warmth = [np.array([temperature])] * ("temperature_C" in about["step"]["inputs"])
     state, points = step(state, now[None], np.array([dt]), *warmth)
     print(",".join(f"{value:.9f}" for value in np.asarray(points).ravel()))

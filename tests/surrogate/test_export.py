@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -183,27 +184,50 @@ def test_the_step_takes_any_batch_and_the_state_is_what_arm_json_says(exported):
         np.testing.assert_allclose(step.run(None, one)[1][0], points[row], atol=1e-9)
 
 
-@pytest.mark.parametrize("engine", ["torch", "onnx"])
-def test_the_example_predicts_a_recording_without_surgisoft(engine, exported, two_runs, tmp_path):
-    model, folder = exported
+def example_of(folder, recording, engine, at) -> subprocess.CompletedProcess:
+    """What the example prints without surgisoft and the other engine, run in folder `at`."""
     other = "onnx" if engine == "torch" else "torch"
     blocked = (
         f"import runpy, sys; sys.modules['surgisoft'] = sys.modules['{other}'] = None; "
         "runpy.run_path(sys.argv.pop(1), run_name='__main__')"
     )
     example = ROOT / "examples" / "exported_arm.py"
-    done = subprocess.run(
-        [sys.executable, "-c", blocked, example, folder, two_runs[0], engine],
+    return subprocess.run(
+        [sys.executable, "-c", blocked, example, folder, recording, engine],
         capture_output=True,
         text=True,
         check=True,
-        cwd=tmp_path,
+        cwd=at,
         env={k: v for k, v in os.environ.items() if k != "PYTHONPATH"},
     )
+
+
+@pytest.mark.parametrize("engine", ["torch", "onnx"])
+def test_the_example_predicts_a_recording_without_surgisoft(engine, exported, two_runs, tmp_path):
+    model, folder = exported
+    done = example_of(folder, two_runs[0], engine, tmp_path)
     found = np.array([line.split(",") for line in done.stdout.splitlines()], float)
     history = exact(two_runs[1])
     expected = history.rows(model.double().predict(history)).detach().flatten(1).numpy()
     np.testing.assert_allclose(found, expected, atol=1e-5)
+    assert "exported_arm.py" not in done.stderr, "a warning of the example"
+
+
+def test_the_example_predicts_with_a_folder_that_does_not_list_elapsed_time(
+    exported, bench, tmp_path
+):
+    """As earlier versions exported it; a recording that begins at 0 s does not need it."""
+    folder = tmp_path / "earlier"
+    shutil.copytree(exported[1], folder)
+    about = json.loads((folder / "arm.json").read_text())
+    assert about["state"].pop("elapsed")
+    (folder / "arm.json").write_text(json.dumps(about))
+    assert bench[1].t_s[0] == 0.0
+    earlier, now = (
+        example_of(place, bench[0], "onnx", tmp_path).stdout for place in (folder, exported[1])
+    )
+    assert len(now.splitlines()) == bench[1].samples
+    assert earlier == now
 
 
 def test_networks_whose_program_depends_on_their_parameters_are_graphs(tmp_path):

@@ -242,6 +242,18 @@ def test_the_file_says_what_is_wrong_in_one_line():
     ]:
         with pytest.raises(ValueError, match=said):
             arm.step(*wrong)
+    two = np.zeros((2, 3))
+    for wrong, said in [
+        (np.zeros(3), r"elapsed_s has shape \(3,\), expected one number or \(2,\)"),
+        (np.zeros((2, 1)), r"elapsed_s has shape \(2, 1\), expected one number or \(2,\)"),
+        (None, "elapsed_s is None, expected finite numbers"),
+        ([0.0, np.inf], r"elapsed_s is \[0\.0, inf\], expected finite numbers"),
+    ]:
+        with pytest.raises(ValueError, match=f"^{said}$"):
+            arm.start(two, elapsed_s=wrong)
+    np.testing.assert_array_equal(arm.start(two, [5.0, 5.0]), arm.start(two, 5.0))
+    with pytest.raises(ValueError, match=r"^dt_s has shape \(3,\), expected one number or \(2,\)$"):
+        arm.step(arm.start(two), two, np.zeros(3))
     with pytest.raises(ValueError, match=r"key points have shape \(1, 2\), expected \(1, 5, 3\)"):
         opened()(lambda time_s, actuation: np.zeros((1, 2))).step(state, np.zeros((1, 3)), 0.1)
     Path("arms.py").write_text(MODELS + "\n")

@@ -53,10 +53,13 @@ class Arm:
         elapsed_s: time since the recording began, s, which a drift follows; one number, or (B,).
         """
         pressure = self._rows(pressure, "pressure")
+        since = self._each(elapsed_s, "elapsed_s", len(pressure))
+        if not np.isfinite(since).all():
+            raise ValueError(f"elapsed_s is {elapsed_s}, expected finite numbers")
         with np.errstate(all="ignore"):
             each = [STEPS["start"]([self.called], row[None])[0] for row in pressure]
         state = np.concatenate(each)
-        state[:, self.elapsed] = np.asarray(elapsed_s, np.float64).reshape(-1, 1)
+        state[:, self.elapsed] = since[:, None]
         return state
 
     def step(self, state, pressure, dt_s, temperature_C=np.nan):
@@ -69,11 +72,11 @@ class Arm:
         batch = len(pressure)
         if state.ndim != 2 or len(state) != batch or state.shape[1] < self.size:
             raise ValueError(f"state has shape {state.shape}, expected ({batch}, {self.size})")
-        given = [np.broadcast_to(np.asarray(dt_s, np.float64), (batch,))]
+        given = [self._each(dt_s, "dt_s", batch)]
         if not (np.isfinite(given[0]) & (given[0] >= 0.0)).all():
             raise ValueError(f"dt_s is {dt_s}, expected 0 s or more")
         if self.warm:
-            given.append(np.broadcast_to(np.asarray(temperature_C, np.float64), (batch,)))
+            given.append(self._each(temperature_C, "temperature_C", batch))
         model: Any = self.called
         if self.called.about["form"] == "runs":
             model = _Run(self.called, state[:, self.size :], given[0], self.keep_rows)
@@ -90,6 +93,12 @@ class Arm:
         if not np.isfinite(given).all():
             raise ValueError(f"{name} is {given.tolist()}, expected finite numbers")
         return given
+
+    def _each(self, given, name, batch):
+        given = np.asarray(given, np.float64)
+        if given.shape not in ((), (1,), (batch,)):
+            raise ValueError(f"{name} has shape {given.shape}, expected one number or ({batch},)")
+        return np.broadcast_to(given, (batch,))
 
 
 class _Run:

@@ -160,7 +160,6 @@ def fit(
     moved = any(recording.kind == "continuous" for recording in train)
     if not effects and network == "haw_nn" and moved and above_noise(result.model.validation):
         given = {
-            "--valid": valid,
             "--inputs": None if inputs == INPUTS else inputs,
             "--prior": prior,
             "--members": None if members == MEMBERS else members,
@@ -171,9 +170,8 @@ def fit(
             "--threads": None if threads == 1 else threads,
         }
         new = typed(f"{output}_with_effects")
-        again = (
-            f"surgisoft fit {typed_once(recordings)}{given_options(given)} --effects auto -o {new}"
-        )
+        files = typed_once(recordings) + (f" --valid {typed_once(valid)}" if valid else "")
+        again = f"surgisoft fit {files}{given_options(given)} --effects auto -o {new}"
         again = with_effect_files(again)
         print(f"next, whether the arm has memory that this model lacks: {again}")
     following = with_effect_files(

@@ -129,10 +129,8 @@ def improve(
         # What was amended to a change is not compared with the recordings from before it again.
         earlier_files = None if result.claimed else before
         given = (typed_once(recordings), before_files(earlier_files, paired))
-        found = result.diagnoses[-1]
-        command = (
-            with_effect_files(found.command(typed(last), *given)) if found.next_command else ""
-        )
+        of_last = "" if result.claimed else model_options(None, model_error)
+        command = _command(result.diagnoses[-1], typed(last), given, of_last)
         written += write_improve_report(result, tables, report, title, command)
     if replay:
         written.append(write_before_and_after(result, tables, model.name, replay))
@@ -185,7 +183,12 @@ def _following(result, model: str, files: tuple[str, str], of_model: str) -> str
     if found.setup is not None and found.setup.correctable:
         again = f"surgisoft diagnose {model} {files[0]} --apply CORRECTED{of_model}"
         return with_effect_files(again)
-    if not found.next_command or found.verdict.kind in NAMING:
+    return "" if found.verdict.kind in NAMING else _command(found, model, files, of_model)
+
+
+def _command(found, model: str, files: tuple[str, str], of_model: str) -> str:
+    """What a diagnosis recommends, as a command with the options of its model; empty without."""
+    if not found.next_command:
         return ""
     command = found.command(model, *files)
     return with_effect_files(command if command.split()[1] == "fit" else command + of_model)

@@ -199,6 +199,28 @@ def test_what_follows_an_amended_callable_runs_as_it_is_printed(capsys, tmp_path
         assert opened[0].model.validation.rmse_mm == 1.25, "the folder states it, or the option"
 
 
+def test_the_page_of_an_improvement_has_the_command_that_is_printed(capsys, tmp_path, monkeypatch):
+    """With the error of a callable, which `fit` does not take."""
+    nothing = result(
+        claimed=False, rounds=[], steps=[], diagnoses=[diagnosis()], sentence="none", model=None
+    )  # fmt: skip
+    monkeypatch.setattr("surgisoft.diagnosis.improve.improve", lambda *_, **__: nothing)
+    monkeypatch.setattr("surgisoft.diagnosis.compare.tables_of", lambda *_: {})
+    page = "surgisoft.diagnosis.pages.amendment.write_improve_report"
+    monkeypatch.setattr(page, lambda *given: [f"page: {given[-1]}"])
+    command = "improve my_arm.py:arm bench.parquet --model-error 1.25"
+    for template, expected in (
+        ("diagnose {model} {data}", "diagnose my_arm.py:arm bench.parquet --model-error 1.25"),
+        ("fit {data} -o NEW", "fit bench.parquet -o NEW"),
+    ):
+        nothing.diagnoses[0].next_command = f"surgisoft {template}"
+        files = f" -o {tmp_path / 'new'} --report {tmp_path / 'page'}"
+        assert run((command + files).split()) == 1
+        out = capsys.readouterr().out
+        assert f"page: surgisoft {expected}\n" in out
+        assert out.endswith(f"next: surgisoft {expected}\n")
+
+
 PLAN, AMEND = "next-experiment MODEL REC --between creep payload", "amend MODEL --data REC"
 NEXT = [
     ("lab", "REC --predictions lab.csv --model-error 1.24", PLAN),

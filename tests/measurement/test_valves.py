@@ -1,6 +1,7 @@
 """Lags between command and measurement: of first-order systems in closed form, and of no others."""
 
 import re
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -44,6 +45,16 @@ def test_lag_and_dead_time_are_those_of_the_closed_form(dead_s):
     assert [each.dead_s for each in found] == pytest.approx([dead_s] * 3, abs=0.02)
 
 
+def test_many_short_runs_cost_as_much_as_one_long_run():
+    def seconds(runs):
+        start = time.process_time()
+        valve_lags(behind([0.3, 0.3, 0.3], rows=4000, runs=runs))
+        return time.process_time() - start
+
+    seconds(1)
+    assert seconds(2000) < 6.0 * seconds(1)
+
+
 def test_a_sensor_with_outliers_and_an_offset_has_the_same_lag():
     given = behind([0.3])
     measured = given.measured.copy()
@@ -83,6 +94,20 @@ def test_valves_that_became_slower_are_told_by_channel():
     assert [float(each) for each in said.groups()] == pytest.approx([0.6, 0.2], rel=0.05)
     assert changed_valves([before], [behind([0.11, 0.21], seed=4)]) == ""
     assert changed_valves([after], [replace(before, commanded=None)]) == ""
+
+
+@pytest.mark.parametrize("before", [[], [replace(behind([0.2]), commanded=None)]])
+def test_without_lags_before_none_are_looked_for_after(before, monkeypatch):
+    looked = []
+
+    def counted(recording):
+        looked.append(recording)
+        return valve_lags(recording)
+
+    monkeypatch.setattr("surgisoft.measurement.recordings.valves.valve_lags", counted)
+    after = behind([0.2], seed=3)
+    assert changed_valves([after], before) == ""
+    assert not any(recording is after for recording in looked)
 
 
 @pytest.mark.parametrize(

@@ -100,6 +100,11 @@ class _Look:
         self.command, self.measured = command[rows], recording.measured[rows]
         self.kept = np.ones(self.measured.shape)
         self.first = np.concatenate([[True], np.diff(recording.run[rows]) != 0])
+        steps = np.where(self.first, 1.0, np.diff(self.t_s, prepend=self.t_s[0]).clip(min=0.0))
+        self.clock_s = np.cumsum(steps)
+        """(T,) times that increase from run to run [s]."""
+        self.begin_s = self.clock_s[self.first][np.cumsum(self.first) - 1]
+        """(T,) the time at which each row's run begins [s]."""
 
     def least(self, lags: np.ndarray, dead: np.ndarray) -> list[ValveLag]:
         """For each channel the best of lags (K, m) and dead times (J,), refined twice [s]."""
@@ -163,13 +168,11 @@ class _Look:
         """(T, K) of values (T, K), so much later; the first of its run where there is none yet."""
         if late_s == 0.0:
             return values
-        begins = np.flatnonzero(self.first)
-        answer = np.empty_like(values)
-        for begin, end in zip(begins, np.append(begins[1:], len(values)), strict=True):
-            times, part = self.t_s[begin:end], values[begin:end]
-            for k in range(values.shape[1]):
-                answer[begin:end, k] = np.interp(times - late_s, times, part[:, k])
-        return answer
+        wanted = np.maximum(self.clock_s - late_s, self.begin_s)
+        place = np.interp(wanted, self.clock_s, np.arange(len(values)))
+        low = np.minimum(place.astype(int), max(len(values) - 2, 0))
+        part = (place - low)[:, None]
+        return values[low] * (1.0 - part) + values[low + 1] * part
 
 
 def _around(grid: np.ndarray, places: list[int]) -> np.ndarray:
@@ -227,8 +230,10 @@ def changed_valves(after: Sequence[Recording], before: Sequence[Recording]) -> s
 
     Channels are compared by the median over the recordings that show their lag.
     """
-    now, then = _medians(after), _medians(before)
-    changes = []
+    then = _medians(before)
+    if not any(then):
+        return ""
+    now, changes = _medians(after), []
     for k, (new, old) in enumerate(zip(now, then, strict=False)):
         if new is None or old is None:
             continue

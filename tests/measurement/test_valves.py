@@ -45,6 +45,21 @@ def test_lag_and_dead_time_are_those_of_the_closed_form(dead_s):
     assert [each.dead_s for each in found] == pytest.approx([dead_s] * 3, abs=0.02)
 
 
+def test_no_dead_time_is_told_that_the_rows_cannot_show():
+    """A command that changes smoothly, each value held for a row, and its exact answer."""
+    t_s = STEP_S * np.arange(3000)
+    waves = np.sin(2 * np.pi * np.outer(t_s, [0.13, 0.31, 0.47]) + [0.3, 1.1, 2.0])
+    command = 50.0 + 15.0 * waves @ np.array([[1.0, 1.0], [1.0, -1.0], [0.5, 1.0]])
+    measured = command.copy()
+    for row in range(1, len(t_s)):
+        held = command[row - 1]
+        measured[row] = held + np.exp(-STEP_S / 0.2) * (measured[row - 1] - held)
+    for seed in range(3):
+        noise = np.random.default_rng(seed).normal(0.0, 0.1, measured.shape)
+        given = Recording("v", t_s, measured + noise, np.zeros((3000, 2, 3)), commanded=command)
+        assert valve_words(given) == "measured follows commanded: lag 0.2, 0.2 s"
+
+
 def test_many_short_runs_cost_as_much_as_one_long_run():
     def seconds(runs):
         start = time.process_time()

@@ -37,6 +37,8 @@ OUTLIER_SHARE = 0.5
 lag does not fit exactly is none [-]."""
 DEAD_GAIN = 0.1
 """Least share of what a lag alone leaves that a dead time explains: below, none shows [-]."""
+LEAST_DEAD = 0.5
+"""Shortest dead time that is told, in rows: the rows show none that is shorter [-]."""
 LEAST_CHANGE = 0.3
 """Least difference of two delays that is told, as a share of the longer one ..."""
 LEAST_CHANGE_S = 0.03
@@ -85,7 +87,8 @@ def valve_lags(recording: Recording) -> list[ValveLag | None]:
 
 def _told(plain: float, alone: ValveLag, both: ValveLag, step_s: float) -> ValveLag | None:
     """What is told of a channel; plain: share that is left without a lag; alone: no dead time."""
-    found = both if both.left <= (1 - DEAD_GAIN) * alone.left else alone
+    dead = both.dead_s >= LEAST_DEAD * step_s and both.left <= (1 - DEAD_GAIN) * alone.left
+    found = both if dead else alone
     shows = found.left <= min(MOST_LEFT, (1 - LEAST_GAIN) * plain)
     return found if shows and found.delay_s >= step_s else None
 

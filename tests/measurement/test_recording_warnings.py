@@ -122,7 +122,7 @@ def test_a_run_that_was_appended_twice_is_found():
     (found,) = find_warnings(appended(clean, clean))
     assert found.sample == 300
     assert found.text.startswith(
-        "300 of 600 rows equal earlier ones bit for bit, from here on those from sample 1 on: "
+        "300 of 600 rows equal earlier ones bit for bit, from here on those from 0.000 s of run 3 on: "
     )
     part = dataclasses.replace(
         clean, **{n: getattr(clean, n)[100:150] for n in ("t_s", "run", "measured", "commanded")},
@@ -130,8 +130,31 @@ def test_a_run_that_was_appended_twice_is_found():
     )  # fmt: skip
     (found,) = find_warnings(appended(clean, part))
     assert found.text.startswith("50 of 350 rows equal earlier ones bit for bit, from here on tho")
-    assert "from sample 101 on" in found.text
+    assert "from 5.000 s of run 3 on" in found.text
     assert find_warnings(appended(clean, slow_and_noisy(2, samples=300))) == []
+
+
+def periodic(periods, rows=80, before=100):
+    """A simulation to 3 decimals: a motion, then another one of so many periods of `rows` rows."""
+    phase = np.arange(periods * rows)[:, None] / rows
+    wave = 40 + 30 * np.sin(2 * np.pi * (phase + [0.0, 0.3]))
+    start = wave[:1] + 0.003 * np.square(np.arange(-before, 0.0))[:, None]
+    p = np.round(np.concatenate([start, wave]), 3)
+    t = np.arange(len(p)) / RATE_HZ
+    return Recording("x", t, p, np.round(body(p), 3), commanded=p.copy())
+
+
+@pytest.mark.parametrize("rows", [15, 80])
+def test_a_periodic_motion_without_noise_is_no_copy(rows):
+    assert find_warnings(periodic(6, rows)) == []
+    twice = periodic(2)
+    (found,) = find_warnings(twice)
+    assert found.sample == 180
+    assert found.text.startswith(
+        "80 of 260 rows equal earlier ones bit for bit, from here on those from 5.000 s of run 0 on"
+    )
+    (found,) = find_warnings(appended(periodic(6), periodic(6)))
+    assert found.text.startswith("580 of 1160 rows")
 
 
 def test_an_arm_at_rest_repeats_its_rows():

@@ -48,6 +48,13 @@ COPIED_ROWS = 20
 COPIED_CHANGES = 10
 """Least number of these rows that differ from the row before: an arm at rest before coarse sensors
 gives the same row again."""
+LEAST_PERIODS = 3
+"""From so many periods on, a run without noise repeats its motion: these rows are no copies (a
+count)."""
+MOST_PERIODS = 10
+"""Periods that are tried for a stretch, the shortest first (a count)."""
+MOST_MOTIONS = 20
+"""Periodic motions that are looked for in a run (a count)."""
 MIX = np.uint64(0x9E3779B97F4A7C15)
 """Odd number by which hashes of values are multiplied (2^64 over the golden ratio, Knuth 1973)."""
 
@@ -101,6 +108,9 @@ def _copied_rows(recording: Recording) -> list[QualityWarning]:
     stretch, counts = _stretch_hashes(recording)
     _, first, which = np.unique(stretch, return_index=True, return_inverse=True)
     copied = np.flatnonzero(counts & (first[which] < np.arange(len(stretch))))
+    run = recording.run
+    in_one = copied[run[copied] == run[first[which[copied]]]]
+    copied = copied[~np.isin(copied, in_one[_periodic(recording, stretch, in_one)[in_one]])]
     if not len(copied):
         return []
     edges = np.zeros(recording.samples + 1, np.int64)
@@ -108,12 +118,46 @@ def _copied_rows(recording: Recording) -> list[QualityWarning]:
     np.add.at(edges, copied + COPIED_ROWS, -1)
     rows = int((np.cumsum(edges) > 0).sum())
     start = int(copied[0])
+    earlier = int(first[which][start])
     text = (
         f"{rows} of {recording.samples} rows equal earlier ones bit for bit, from here on those "
-        f"from sample {int(first[which][start]) + 1} on: copies count twice in a fit, and held-out "
-        "rows are known to it; remove them"
+        f"from {recording.t_s[earlier]:.3f} s of run {recording.run[earlier]} on: copies count "
+        "twice in a fit, and held-out rows are known to it; remove them"
     )
     return [QualityWarning(start, text)]
+
+
+def _periodic(recording: Recording, stretch: np.ndarray, copied: np.ndarray) -> np.ndarray:
+    """(S,) bool: the stretches of a motion that a run repeats, as simulations without noise do.
+
+    stretch: hashes (S,); copied: the stretches that equal earlier ones of their run.
+    """
+    found = np.zeros(len(stretch), bool)
+    for run in recording.runs:
+        last = max(run.stop - COPIED_ROWS + 1, run.start)
+        inside, own = stretch[run.start : last], copied[(copied >= run.start) & (copied < last)]
+        for _ in range(MOST_MOTIONS):
+            own = own[~found[own]]
+            if not len(own):
+                break
+            motion = _motion_around(inside, int(own[len(own) // 2]) - run.start)
+            if motion is None:
+                break
+            found[run.start + motion.start : run.start + motion.stop] = True
+    return found
+
+
+def _motion_around(inside: np.ndarray, place: int) -> slice | None:
+    """The stretches of a run, of hashes (K,), that repeat with one period around one of them."""
+    earlier = np.flatnonzero(inside[:place] == inside[place])[::-1]
+    for period in (place - earlier[:MOST_PERIODS]).tolist():
+        differs = np.flatnonzero(inside[period:] != inside[:-period])
+        at = int(np.searchsorted(differs, place - period))
+        start = int(differs[at - 1]) + 1 if at else 0
+        end = int(differs[at]) if at < len(differs) else len(inside) - period
+        if end - start > (LEAST_PERIODS - 1) * period - COPIED_ROWS:
+            return slice(start, end + period)
+    return None
 
 
 def copies_of_others(recordings: list[Recording]) -> list[str]:

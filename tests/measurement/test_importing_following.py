@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from surgisoft.cli import run
 from surgisoft.measurement.importing.following import following, following_warnings
+from surgisoft.measurement.importing.timing import body_lead
 from surgisoft.measurement.recordings import Recording
 from tests.measurement.test_recording_timing import RATE_HZ, bent, lagged, played, wander
 
@@ -44,6 +46,14 @@ def recorded(change=lambda p: p, seed=0, seconds=SECONDS, noise_mm=0.05, kind="c
     return Recording("arm", t_s, p, points, kind=kind)
 
 
+def swung(p, hz, damping):
+    """The actuation through an oscillator of this frequency and damping ratio, at rest at first."""
+    decay = np.exp(-damping * 2 * np.pi * hz / RATE_HZ)
+    angle = 2 * np.pi * hz * np.sqrt(1 - damping**2) / RATE_HZ
+    poles = [1.0, -2 * decay * np.cos(angle), decay**2]
+    return lfilter([sum(poles)], poles, p - p[0], axis=0) + p[0]
+
+
 FOLLOWS = {
     "at once": lambda p: p,
     "behind a lag of 1 s": lambda p: lagged(p, 1.0),
@@ -51,6 +61,11 @@ FOLLOWS = {
     "behind three lags of 0.5 s": lambda p: lagged(p, 0.5, 3),
     "with hysteresis": lambda p: played(p, 12.0),
     "with one chamber of three": lambda p: np.concatenate([p[:, :1], 0 * p[:, 1:] + 20.0], axis=1),
+    "with a swing of 1 Hz": lambda p: swung(p, 1.0, 0.05),
+    "with a swing of 0.4 Hz": lambda p: swung(p, 0.4, 0.1),
+    "with a swing of 0.4 Hz that hardly decays": lambda p: swung(p, 0.4, 0.02),
+    "beyond a dead zone": lambda p: 8 * np.maximum(p - np.quantile(p, 0.93, axis=0), 0.0),
+    "up and down again": lambda p: 30 + 20 * np.sin(p / 4),
     "with creep": lambda p: p + 0.5 * lagged(p, 60.0),
 }
 
@@ -59,7 +74,7 @@ FOLLOWS = {
 def test_an_arm_that_follows_in_any_way_is_not_told(name):
     given = recorded(FOLLOWS[name])
     assert following_warnings(given, {"measured": 0.0}) == []
-    assert following(given).explained > 0.5
+    assert following(given).explained > 0.3
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -68,7 +83,9 @@ def test_the_log_of_another_recording_is_told(seed):
     given = recorded(lambda p: lagged(p, 0.3), seed)
     mixed = replace(given, measured=recorded(seed=seed + 100).measured)
     (warning,) = following_warnings(mixed, {"measured": 0.0})
-    assert "the key points do not follow the actuation" in warning
+    assert "the key points hardly follow the actuation" in warning
+    share = max(following(mixed).shifted, 0.0)
+    assert f": it explains {share:.0%} of their motion (cross-validated" in warning
     assert "check that the files are of the same recording" in warning
 
 
@@ -98,6 +115,23 @@ def test_what_a_recording_cannot_show_is_not_told():
     assert following(replace(given, measured=np.full_like(given.measured, 10.0))) is None
 
 
+@pytest.mark.parametrize("noise_mm", [0.0, 0.05])
+@pytest.mark.parametrize("second", [0, 1, 60])
+def test_a_single_step_shows_nothing_or_that_the_body_follows(second, noise_mm):
+    """A ramp of one second, held for the rest of two minutes, to 3 decimals."""
+    t_s = np.arange(2400) / 20.0
+    p = np.round(50.0 * np.clip(t_s - second, 0.0, 1.0)[:, None], 3)
+    noise = np.random.default_rng(0).normal(0.0, noise_mm, (2400, 2, 3))
+    points = np.round(
+        noise + np.array([[0.0, 10.0, 20.0], [0.0, 30.0, 40.0]]) * (p / 50)[..., None], 3
+    )
+    given = Recording("step", t_s, p, points)
+    assert following_warnings(given, {"measured": 0.0}) == []
+    assert body_lead(given) is None
+    found = following(given)
+    assert found is None if second < 60 else found.explained > 0.9
+
+
 def test_an_import_warns_of_files_that_do_not_belong_together(tmp_path, capsys):
     """The air log of one recording, and the camera's file of another one."""
     body, air = recorded(seed=1), recorded(seed=2)
@@ -112,4 +146,4 @@ def test_an_import_warns_of_files_that_do_not_belong_together(tmp_path, capsys):
     asked = ["--map", str(tmp_path / "map.toml"), "-o", str(tmp_path / "a.parquet")]
     assert run([*given, *asked]) == 0
     said = capsys.readouterr()
-    assert "a.parquet: the key points do not follow the actuation" in said.out + said.err
+    assert "a.parquet: the key points hardly follow the actuation" in said.out + said.err

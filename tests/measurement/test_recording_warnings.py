@@ -122,7 +122,7 @@ def test_a_run_that_was_appended_twice_is_found():
     (found,) = find_warnings(appended(clean, clean))
     assert found.sample == 300
     assert found.text.startswith(
-        "300 of 600 rows equal earlier ones bit for bit, from here on those from 0.000 s of run 3 on: "
+        "300 of 600 rows equal earlier ones bit for bit, from here on those from 0.000 s of run 3"
     )
     part = dataclasses.replace(
         clean, **{n: getattr(clean, n)[100:150] for n in ("t_s", "run", "measured", "commanded")},
@@ -137,7 +137,7 @@ def test_a_run_that_was_appended_twice_is_found():
 def periodic(periods, rows=80, before=100):
     """A simulation to 3 decimals: a motion, then another one of so many periods of `rows` rows."""
     phase = np.arange(periods * rows)[:, None] / rows
-    wave = 40 + 30 * np.sin(2 * np.pi * (phase + [0.0, 0.3]))
+    wave = 40 + 30 * np.sin(2 * np.pi * (phase + np.array([0.0, 0.3])))
     start = wave[:1] + 0.003 * np.square(np.arange(-before, 0.0))[:, None]
     p = np.round(np.concatenate([start, wave]), 3)
     t = np.arange(len(p)) / RATE_HZ

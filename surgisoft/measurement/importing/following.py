@@ -1,27 +1,41 @@
 """Whether key points follow the actuation at all: else it may be the log of another recording.
 
-Three regressions on a quadratic function of the actuation are cross-validated by blocks of time.
-Moves of the body are regressed on moves of the actuation, shifted by a few seconds (`Moves`), and
-then by any time at which half of the recording is left; and positions on the actuation behind lags
-of up to minutes. The best one says what share of the body's motion the actuation explains: nearly
-all on an arm, whatever its lag and its hysteresis, and nothing where files were mixed up.
+Four regressions are cross-validated by blocks of time. Moves of the body are regressed on those of
+a quadratic function of the actuation, shifted by a few seconds (`Moves`), and then by any time at
+which half of the recording is left; positions on the actuation behind lags of up to minutes, and on
+the body's own past with and without functions of each channel, for arms that swing on for long.
+The best one says what share the actuation explains: much of it on usual arms, nearly nothing where
+files were mixed up. A small share is no proof: an arm may depend on its actuation in another way.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from surgisoft.measurement.importing.timing import BLOCKS, FOLDS, RIDGE, Moves, set_delay
+from surgisoft.measurement.importing.timing import (
+    BLOCKS,
+    FOLDS,
+    LEAST_ROWS,
+    RIDGE,
+    Moves,
+    set_delay,
+)
 from surgisoft.measurement.recordings import Recording
 
 EXPLAINED = 0.3
-"""Largest share of the body's motion that an actuation explains by chance [-]."""
+"""Share of the body's motion beyond which it follows the actuation as recorded: no long shift is
+tried [-]."""
+HARDLY = 0.15
+"""Share of the body's motion as recorded up to which an actuation may be that of another recording:
+at the best of many long shifts, chance explains up to EXPLAINED [-]."""
 LEAST_OFFSET = 0.6
 """Least share that the actuation explains where it is shifted by a time that is named [-]."""
 ABOVE_NOISE = 4.0
 """Least mean square of the longest moves, as a multiple of those from one sample to the next: where
 the body moves no more than that, noise may be all there is [-]."""
+LEAST_JUDGED = 0.5
+"""Least mean square of the moves that are judged, as a share of that of all moves [-]."""
 LEAST_LENGTHS = 20
 """Least duration, in lengths of the longest moves: fewer are no sample (a count)."""
 SHIFTED_ROWS = 1500
@@ -30,6 +44,12 @@ MOST_SHIFTS = 600
 """Most long shifts that are tried (a count)."""
 LAGS_S = (0.0, 1.0, 4.0, 16.0, 60.0)
 """Lags of the actuation behind which positions are looked at [s]."""
+PAST, MAIN_MOTIONS = 3, 3
+"""Positions of the body's past, and directions of its motion that are looked at (counts)."""
+AHEAD = (1, 3)
+"""Times between these positions, in lengths of the longest moves [-]."""
+KNOTS = 7
+"""Knots of the piecewise linear functions of a channel (a count)."""
 LAGGED_ROWS = 3000
 """Most rows of that regression (a count)."""
 
@@ -39,7 +59,8 @@ class Following:
     """How much of the body's motion an actuation explains."""
 
     explained: float
-    """Largest share of the motion that is explained as recorded, at most a few seconds late [-]."""
+    """Largest share of the motion, or of what the body's own past leaves of it, that is explained
+    as recorded, at most a few seconds late [-]."""
     shifted: float
     """Largest share with the actuation shifted by any time [-]."""
     shift_s: float
@@ -49,7 +70,8 @@ class Following:
 def following(recording: Recording) -> Following | None:
     """How much the actuation explains; None where the recording cannot show it.
 
-    It cannot with steady-state samples, few rows, and a body or an actuation that hardly moves.
+    It cannot with steady-state samples, few rows, and a body or an actuation that hardly moves, or
+    moves mostly in the first seconds of its runs, which no shift leaves to look at.
     """
     if recording.kind == "settled":
         return None
@@ -61,9 +83,10 @@ def following(recording: Recording) -> Following | None:
     shift_s = float(shifts[best]) * moves.step_s
     if explained > EXPLAINED:
         return Following(explained, explained, shift_s)
-    explained = max(explained, _behind_lags(moves))
-    if explained > EXPLAINED:
-        return Following(explained, explained, shift_s)
+    for share in (_behind_lags, _beyond_own_past):
+        explained = max(explained, share(moves))
+        if explained > EXPLAINED:
+            return Following(explained, explained, shift_s)
     shifted, late = max(_far(moves), (explained, shift_s))
     return Following(explained, shifted, late)
 
@@ -80,30 +103,42 @@ def following_warnings(recording: Recording, delays_s: Mapping[str, float]) -> l
         how = "late" if found.shift_s > 0 else "early"
         return [
             f"the key points follow the actuation {abs(found.shift_s):.3g} s {how} "
-            f"({found.shifted:.0%} of their motion is explained then, and none as the times are): "
-            f"if the clocks of the files are apart, {set_delay(delays_s, -found.shift_s, '.3g')}"
+            f"({found.shifted:.0%} of their motion is explained then, and "
+            f"{_percent(found.explained)} as the times are): if the clocks of the files are apart, "
+            f"{set_delay(delays_s, -found.shift_s, '.3g')}"
         ]
-    if found.shifted > EXPLAINED:
+    if found.explained > HARDLY or found.shifted > EXPLAINED:
         return []
     return [
-        "the key points do not follow the actuation: it explains nothing of their motion "
-        "(cross-validated, at any shift in time): check that the files are of the same recording, "
-        "and the columns of [measured] and [key_points] in the map"
+        f"the key points hardly follow the actuation: it explains {_percent(found.shifted)} of "
+        "their motion (cross-validated, at the best shift in time): check that the files are of "
+        "the same recording, and the columns of [measured] and [key_points] in the map"
     ]
 
 
+def _percent(share: float) -> str:
+    return f"{max(share, 0.0):.0%}"
+
+
 def _moving(moves: Moves) -> bool:
-    """Whether the body moves above its noise, for long enough."""
+    """Whether the body moves above its noise, for long enough, and body and actuation do so where
+    they are judged, too."""
     length = moves.longest
     duration = sum(len(part) for part in moves.body)
-    if duration < LEAST_LENGTHS * length:
+    if length < 2 or duration < LEAST_LENGTHS * length:
         return False
-    mean = [_mean_square(moves, each) for each in (length, 1)]
-    return length > 1 and mean[0] >= ABOVE_NOISE * mean[1]
+    judged = moves.mean_square(length)
+    if judged <= 0.0 or judged < LEAST_JUDGED * _mean_square(moves.body, length):
+        return False
+    actuated = replace(moves, body=moves.actuation).mean_square(length)
+    if actuated < LEAST_JUDGED * _mean_square(moves.actuation, length):
+        return False
+    return judged >= ABOVE_NOISE * max(moves.mean_square(length, 1), _mean_square(moves.body, 1))
 
 
-def _mean_square(moves: Moves, length: int) -> float:
-    moved = [part[length:] - part[:-length] for part in moves.body if len(part) > length]
+def _mean_square(parts: list[np.ndarray], length: int) -> float:
+    """Mean square of all moves of this length of runs (G, d)."""
+    moved = [part[length:] - part[:-length] for part in parts if len(part) > length]
     return float(np.nanmean(np.square(np.concatenate(moved)), axis=0).sum())
 
 
@@ -125,8 +160,7 @@ def _far(moves: Moves) -> tuple[float, float]:
 
 
 def _behind_lags(moves: Moves) -> float:
-    """Share of the positions' variance that the actuation behind lags explains, each run from its
-    own mean."""
+    """Share of the positions' variance that the actuation behind lags explains."""
     features, places = [], []
     every = max(1, sum(len(part) for part in moves.body) // LAGGED_ROWS)
     for actuation, body in zip(moves.actuation, moves.body, strict=True):
@@ -139,6 +173,53 @@ def _behind_lags(moves: Moves) -> float:
     x, y = np.concatenate(features), np.concatenate(places)
     if len(x) < BLOCKS:
         return 0.0
+    left, total = _errors(x, y)
+    return 1 - left / max(total, 1e-300)
+
+
+def _beyond_own_past(moves: Moves) -> float:
+    """Share of what the body's own past leaves of its positions that the actuation explains.
+
+    The past tells where a swing goes on to, whatever its frequency and damping.
+    """
+    return max(_beyond_past(moves, times * moves.longest) for times in AHEAD)
+
+
+def _beyond_past(moves: Moves, length: int) -> float:
+    """The share where the past ends so many samples before each position."""
+    every = max(1, sum(len(part) for part in moves.body) // LAGGED_ROWS)
+    known = np.concatenate(moves.body)
+    known = known[~np.isnan(known).any(axis=1)]
+    _, axes = np.linalg.eigh(np.cov(known.T).reshape(known.shape[1], -1))
+    main = axes[:, -MAIN_MOTIONS:]
+    pasts, causes, places = [], [], []
+    for actuation, body in zip(moves.actuation, moves.body, strict=True):
+        at = np.arange(PAST * length, len(body), every)
+        past = np.concatenate([body[at - k * length] @ main for k in range(1, PAST + 1)], axis=1)
+        seen = ~np.isnan(past).any(axis=1) & ~np.isnan(body[at]).any(axis=1)
+        at = at[seen]
+        delays = (np.arange(2 * PAST - 1) * length) // 2
+        causes.append(np.concatenate([_bent(actuation[at - late]) for late in delays], axis=1))
+        pasts.append(past[seen])
+        places.append(body[at] @ main)
+    past, cause, y = (np.concatenate(each) for each in (pasts, causes, places))
+    if len(y) < LEAST_ROWS:
+        return 0.0
+    alone, _ = _errors(past, y)
+    both, _ = _errors(np.concatenate([past, cause], axis=1), y)
+    return 1 - both / max(alone, 1e-300)
+
+
+def _bent(actuation: np.ndarray) -> np.ndarray:
+    """(S, k) of actuation (S, m) in [-1, 1]: piecewise linear functions of each channel."""
+    knots = np.linspace(-1.0, 1.0, KNOTS)
+    hats = np.maximum(0.0, 1.0 - np.abs(actuation[:, :, None] - knots) / (knots[1] - knots[0]))
+    return hats.reshape(len(actuation), -1)
+
+
+def _errors(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+    """Cross-validated squared error of y (S, d) regressed on x (S, k), and that of its mean."""
+    x = x / np.maximum(x.std(axis=0), 1e-12)
     fold = (np.arange(len(x)) * BLOCKS // len(x)) % FOLDS
     left = total = 0.0
     for k in range(FOLDS):
@@ -150,7 +231,7 @@ def _behind_lags(moves: Moves) -> float:
         slope = np.linalg.solve(gram, inside.T @ (y[others] - mean))
         left += float(np.square(y[own] - mean - (x[own] - centre) @ slope).sum())
         total += float(np.square(y[own] - mean).sum())
-    return 1 - left / max(total, 1e-300)
+    return left, total
 
 
 def _lagged(values: np.ndarray, rows: float) -> np.ndarray:

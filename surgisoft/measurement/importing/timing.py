@@ -98,6 +98,16 @@ class Moves:
         """Sum of squares of the moves of this length, mm^2."""
         return float(np.square(self._rows(length)[1]).sum())
 
+    def mean_square(self, length: int, part: int | None = None) -> float:
+        """Mean square of the moves of this length that are compared [mm^2], or of only the last
+        `part` samples of each; 0 without any."""
+        rows, moved = self._rows(length)
+        if part is not None:
+            pairs = zip(self.body, rows, strict=True)
+            moved = np.concatenate([body[at] - body[at - part] for body, at in pairs])
+        known = moved[~np.isnan(moved).any(axis=1)]
+        return float(np.square(known).sum(axis=1).mean()) if len(known) else 0.0
+
     def search(self, length: int) -> tuple[np.ndarray, int, np.ndarray]:
         """Shifts (K,) in samples, the place of the best one, and squared errors (K, BLOCKS) mm^2.
 
@@ -304,7 +314,7 @@ def body_lead(recording: Recording) -> Lead | None:
     if recording.kind == "settled":
         return None
     moves = Moves.of(recording)
-    if moves is None:
+    if moves is None or moves.power(moves.longest) == 0.0:
         return None
     first, best, error = moves.search(moves.longest)
     causal = error[first >= 0].sum(axis=1)
@@ -317,7 +327,7 @@ def body_lead(recording: Recording) -> Lead | None:
     while length > 1:
         length = length // 2
         shifts, at, losses = moves.search(length)
-        explained = 1 - losses[at].sum() / moves.power(length)
+        explained = 1 - losses[at].sum() / max(moves.power(length), 1e-300)
         if explained >= LEAST_SPEED_R2 and shifts[at] > SAME_LEAD * first[best]:
             return None
     seconds, spread = _jackknife(first, error)

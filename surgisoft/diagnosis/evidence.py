@@ -206,10 +206,12 @@ class Evidence:
     """Time from which on it is shifted, s, all recordings in turn."""
 
     def to_json(self) -> dict:
-        """Plain values; no frequency of a line where there is none, as in evidence of before."""
+        """Plain values; no frequency of a line and no moment of a jump where there is none, as in
+        evidence of before."""
         plain = asdict(self)
-        if not self.line_hz:
-            del plain["line_hz"]
+        for name in ("line_hz", "jump_largest_s"):
+            if not plain[name]:
+                del plain[name]
         return plain
 
     @classmethod

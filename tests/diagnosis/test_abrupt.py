@@ -168,6 +168,23 @@ def test_the_words_say_what_was_put_in():
     assert "times, by up to" in told
 
 
+def test_the_largest_jump_has_its_moment():
+    """Two jumps of the whole body, in a second recording; its rows follow those of the first."""
+    change = np.zeros((ROWS, 3, 3))
+    change[400:] += 2.0
+    change[1000:] += 5.0
+    first, second = moved_by(np.zeros((ROWS, 3, 3))), moved_by(change)
+    found = abrupt_changes(residual_table(still_model(), [second]).training())
+    assert found["jump_largest_s"] == pytest.approx(1000 * PERIOD_S)
+    (told,) = jumping(Numbers(found))
+    assert "(at 100.00 s), while neither" in told
+    table = residual_table(still_model(), [first, second])
+    found = abrupt_changes(table.training())
+    assert found["jump_largest_s"] == pytest.approx(float(table.along_s[ROWS + 1000]))
+    (told,) = jumping(Numbers(found), 2)
+    assert " s, all recordings in turn), while neither" in told
+
+
 def test_the_result_says_it_once(monkeypatch):
     """A slip is a jump, too, but is told as a slip; beside a named effect both are checks."""
     told = diagnose(still_model(), [moved_by(bending() + shifted(2, 500, [0.0, 1.6, 0.0]))])

@@ -70,6 +70,7 @@ def test_training_residuals_of_other_rows_are_refused(folder):
         ("past_t_s", lambda t_s: -t_s, "not in order"),
         ("past_run", lambda run: run.flip(0), "not in order"),
         ("past_t_s", None, "missing 1 required"),
+        ("past_stood", lambda stood: stood[:-1], "not say of each run where it begins"),
     ],
 )
 def test_the_actuation_before_the_residuals_fits_them_or_is_refused(folder, name, change, words):
@@ -77,10 +78,17 @@ def test_the_actuation_before_the_residuals_fits_them_or_is_refused(folder, name
     known = load_file(folder / "known_error.safetensors")
     count = torch.arange(rows, dtype=torch.int32)
     past = {"t_s": count * 0.05, "actuation": torch.ones(rows, chambers), "run": count // 700}
-    past = {f"past_{each}": value for each, value in (past | {"row": count}).items()}
+    past |= {"row": count, "stood": torch.full((int(count[-1]) // 700 + 1, chambers), 3.0)}
+    past = {f"past_{each}": value for each, value in past.items()}
+    former = {each: value for each, value in past.items() if each != "past_stood"}
+    save_file(known | former, folder / "known_error.safetensors")
+    assert load_model(folder).training_residuals.past.stood is None
+    save_model(load_model(folder), folder.parent / "former")
+    assert load_model(folder.parent / "former").training_residuals.past.stood is None
     save_file(known | past, folder / "known_error.safetensors")
     kept = load_model(folder).training_residuals.past
     assert torch.equal(kept.row, count)
+    assert torch.equal(kept.stood, past["past_stood"])
     save_model(load_model(folder), folder.parent / "again")
     again = load_model(folder.parent / "again").training_residuals.past
     assert all(torch.equal(value, getattr(kept, each)) for each, value in vars(again).items())

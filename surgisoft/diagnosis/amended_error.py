@@ -16,7 +16,7 @@ import torch
 from surgisoft.diagnosis.residuals import Problem, noise_of_validation
 from surgisoft.surrogate.history import pack
 from surgisoft.surrogate.model import ArmModel
-from surgisoft.surrogate.training_residuals import TrainingResiduals
+from surgisoft.surrogate.training_residuals import Past
 
 
 @torch.no_grad()
@@ -32,7 +32,7 @@ def state_residuals(model: ArmModel, given: ArmModel, retuned: bool = False) -> 
     past = None if known is None else known.past
     if known is None or past is None or past.stood is None or not len(past.row):
         return
-    residual = _residuals_mm(model, given, known)
+    residual = known.residual_mm + _difference_mm(given, model, past)
     if residual.square().nansum() < known.residual_mm.square().nansum():
         model.training_residuals = replace(known, residual_mm=residual)
 
@@ -76,17 +76,15 @@ def state_error(model: ArmModel, given: ArmModel, held_out: Problem) -> None:
     )
 
 
-def _residuals_mm(model: ArmModel, given: ArmModel, known: TrainingResiduals) -> torch.Tensor:
-    """(S, n, 3) residuals of another model than the given one on the rows of its fit, mm."""
-    past = known.past
-    assert past is not None
+def _difference_mm(given: ArmModel, model: ArmModel, past: Past) -> torch.Tensor:
+    """(S, n, 3) how far a model predicts less than the given one on the rows of its fit, mm."""
     runs = torch.unique_consecutive(past.run, return_counts=True)[1].tolist()
-    t_s, actuation = list(past.t_s.split(runs)), list(past.actuation.split(runs))
     nowhere = [torch.full((count, model.spec.key_points, 3), torch.nan) for count in runs]
+    t_s, actuation = list(past.t_s.split(runs)), list(past.actuation.split(runs))
     stood = None if past.stood is None else list(past.stood)
     history = pack(t_s, actuation, nowhere, stood=stood)
     was, now = (history.rows(each.predict(history))[past.row] for each in (given, model))
-    return known.residual_mm + (was - now)
+    return was - now
 
 
 def _mean_square(residual: np.ndarray) -> np.ndarray:

@@ -1,6 +1,7 @@
 """`surgisoft import`: convert other files to recordings; `surgisoft recording`: summarise them."""
 
 import textwrap
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,7 +11,7 @@ from surgisoft.cli import app
 from surgisoft.cli.inputs import IN_A_MAP, check_model, read_recordings, warn
 from surgisoft.cli.options import EffectFiles, Force, Recordings
 from surgisoft.command_line import typed
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, counted
 from surgisoft.files import resolved
 
 if TYPE_CHECKING:
@@ -229,13 +230,38 @@ def recording_(
             help="With --lerobot: frames per second; default: the recordings' own rate.",
         ),
     ] = None,
+    begin: Annotated[
+        float | None,
+        typer.Option(
+            "--from", metavar="S", help="With -o: the first rows up to this time are left out, s."
+        ),
+    ] = None,
+    end: Annotated[
+        float | None,
+        typer.Option(
+            "--until", metavar="S", help="With -o: the rows from this time on are left out, s."
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="PART",
+            help="Write the rows between --from and --until as a new recording (.csv, .parquet).",
+        ),
+    ] = None,
+    force: Force = False,
 ) -> None:
     """Show what recordings hold: rows, runs, rates, ranges, missing values, warnings.
 
-    With --lerobot they are also written as a LeRobotDataset, from which LeRobot trains policies.
+    With --from or --until, and -o, a part of one recording is written, such as the rows before a
+    marker slipped. Times are seconds since its first row, as in charts and diagnoses. With
+    --lerobot the recordings are also written as a LeRobotDataset, from which LeRobot trains
+    policies.
     """
 
-    from surgisoft.measurement.recordings import summary
+    from surgisoft.measurement.recordings import check_writable, part_of, save_recording, summary
     from surgisoft.measurement.recordings.lerobot import TASK, save_lerobot
     from surgisoft.memory import keep_freed_memory
 
@@ -243,10 +269,29 @@ def recording_(
     others = {"--lerobot-task": task, "--fps": fps}
     if lerobot is None and (unused := [o for o, value in others.items() if value is not None]):
         raise InputError(f"{' and '.join(unused)}: for a LeRobotDataset; add --lerobot DIR")
+    cut = [option for option, time in (("--from", begin), ("--until", end)) if time is not None]
+    if cut and output is None:
+        raise InputError(f"{' and '.join(cut)}: for a part of the recording; add -o PART.parquet")
+    if output is not None and not cut:
+        raise InputError("-o writes a part of the recording; add --from S, --until S or both")
+    if output is not None:
+        check_writable(output, force)
     opened = read_recordings(recordings)
+    if output is not None:
+        if len(opened) > 1:
+            raise InputError(
+                f"{' and '.join(cut)}: the times of one recording, got {len(opened)} recordings; "
+                "cut them one by one"
+            )
+        if opened[0].source is not None and resolved(output) == resolved(opened[0].source):
+            raise InputError(f"{output}: is the recording itself; choose another name with -o")
+        opened = [replace(part_of(opened[0], begin, end), name=output.stem)]
     for recording in opened:
         print(*summary(recording), sep="\n")
     if lerobot:
         for note in save_lerobot(opened, lerobot, TASK if task is None else task, fps):
             print(f"note: {note}")
         print(f"wrote {lerobot}: a LeRobotDataset v3.0")
+    if output is not None:
+        save_recording(opened[0], output, force)
+        print(f"wrote {output}: {counted(opened[0].samples, 'row')}")

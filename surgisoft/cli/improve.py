@@ -165,7 +165,8 @@ def improve(
         raise typer.Exit(INTERRUPTED)
     known = result.model.fitted_rows
     test = "TEST.parquet --test" if known is not None and known.complete else "TEST.parquet"
-    following = with_effect_files(f"surgisoft compare {typed(model, output)} {test} --report PAGE")
+    both = f"{typed(model, output)} {test}{model_options(None, model_error)}"
+    following = with_effect_files(f"surgisoft compare {both} --report PAGE")
     print(f"next, both models on an unseen recording: {following}")
 
 

@@ -166,6 +166,11 @@ CANNOT_TELL = "cannot tell what is missing, if anything"
 """Begin of the sentence of `cannot_tell`."""
 WITHOUT_SLIP = "surgisoft diagnose {model} REC_BEFORE_THE_SLIP{before}"
 """What to run after a marker has slipped: the rows before it say what the arm lacks."""
+CUT_AT_SLIP = "surgisoft recording {{data}} --until {until} -o REC_BEFORE_THE_SLIP.parquet"
+"""What to run before that, where there is one recording: it writes these rows."""
+SLIP_MARGIN = 0.02
+"""How long before the moment of a slip the rows to use end, of the time of the recording: the
+moment is found to within about half of that (`change_points.finer`)."""
 MENTIONED = {
     "identified": "{} is missing",
     "several": "{} are missing",
@@ -832,7 +837,7 @@ def result_of(
     command = next_command(decision, problem.model.trainable)
     if kind == "unknown_effect":
         if slipped(evidence):
-            command = WITHOUT_SLIP
+            command = before_the_slip(evidence, problem.table)
         sentence += "".join(f"; {each}" for each in told)
         told = []
     plan = recommend(problem, effects).experiment if kind == "ambiguous" else None
@@ -1004,6 +1009,17 @@ def slipped(evidence: Evidence, recordings: int = 1) -> list[str]:
         f"the others from {when}: its marker has probably slipped, so use the rows before that "
         "time or record again"
     ]
+
+
+def before_the_slip(evidence: Evidence, table: ResidualTable) -> str:
+    """The command to run after a marker has slipped, with {model}, {data} and {before}.
+
+    Of one recording the rows before the slip are written; which of several it is in is not said.
+    """
+    until = int(evidence.shift_at_s - SLIP_MARGIN * table.along_s[-1])
+    if len(table.names) > 1 or until <= 0:
+        return WITHOUT_SLIP
+    return CUT_AT_SLIP.format(until=until)
 
 
 def error_along(problem: Problem) -> ErrorAlong | None:

@@ -1,6 +1,7 @@
 """Models of other origin on the command line: callables and files of predictions."""
 
 import json
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -197,6 +198,25 @@ def test_what_follows_an_amended_callable_runs_as_it_is_printed(capsys, tmp_path
             assert run(words) == 2
         assert capsys.readouterr().err == "surgisoft: error: opened\n"
         assert opened[0].model.validation.rmse_mm == 1.25, "the folder states it, or the option"
+
+
+def test_the_comparison_after_an_improvement_keeps_the_error_of_a_callable(
+    capsys, tmp_path, monkeypatch
+):
+    """It opens both models: the callable, whose error is an option, and the folder."""
+    rec, other = "bench.parquet", tmp_path / "improved"
+    improve = f"improve my_arm.py:arm {rec} --refit never -o {other}"
+    ended = result(
+        claimed=True, interrupted=False, rounds=[], steps=[], diagnoses=[], sentence="less",
+        model=load_model("default"),
+    )  # fmt: skip
+    monkeypatch.setattr("surgisoft.diagnosis.improve.improve", lambda *_, **__: ended)
+    for more, kept in ((" --model-error 1.25", " --model-error 1.25"), (" --force", "")):
+        assert run((improve + more).split()) == 0
+        line = capsys.readouterr().out.splitlines()[-1]
+        test = r"TEST\.parquet( --test)?"
+        expected = rf"surgisoft compare my_arm\.py:arm {other} {test}{kept} --report PAGE"
+        assert re.search(f": {expected}$", line)
 
 
 def test_the_page_of_an_improvement_has_the_command_that_is_printed(capsys, tmp_path, monkeypatch):

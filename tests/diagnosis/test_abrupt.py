@@ -12,6 +12,7 @@ from surgisoft.diagnosis.evidence import abrupt_changes
 from surgisoft.diagnosis.pairs import before_and_after
 from surgisoft.diagnosis.residuals import problem_of, residual_table
 from surgisoft.measurement.fitting import fit, jump_level
+from surgisoft.measurement.recordings import part_of
 from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.model import Validation
 from tests.diagnosis.synthetic import PERIOD_S, recording, still_model, walk
@@ -236,4 +237,13 @@ def test_after_a_slip_the_next_step_is_a_diagnosis_of_the_rows_before_it():
     found = diagnose(still_model(), [slip], setup_tests=False, refit="never")
     assert found.verdict.kind == "unknown_effect"
     assert "its marker has probably slipped, so use the rows before" in found.verdict.sentence
-    assert found.command("ARM", "REC") == "surgisoft diagnose ARM REC_BEFORE_THE_SLIP"
+    # The command cuts them: those before the slip, but not many fewer.
+    command = found.command("ARM", "REC")
+    until = float(command.split("--until ")[1].split()[0])
+    assert slip.t_s[500] - 0.04 * slip.t_s[-1] - 1.0 <= until <= slip.t_s[500]
+    rest = f"surgisoft recording REC --until {until:.0f} -o REC_BEFORE_THE_SLIP.parquet"
+    assert command == rest
+    # Of several recordings it is not said which one it is in.
+    halves = [part_of(slip, None, 20.0), part_of(slip, 20.0)]
+    two = diagnose(still_model(), halves, setup_tests=False, refit="never")
+    assert two.command("ARM", "REC") == "surgisoft diagnose ARM REC_BEFORE_THE_SLIP"

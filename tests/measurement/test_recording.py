@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
+import surgisoft.cli
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import (
     AlarmInfo,
@@ -18,6 +19,7 @@ from surgisoft.measurement.recordings import (
     check_same_arm,
     load_recording,
     load_recordings,
+    part_of,
     save_recording,
     summary,
 )
@@ -316,3 +318,71 @@ def test_the_alarm_of_a_run_stays_with_its_recording(tmp_path, name):
     path.with_suffix(".toml").write_text("[alarm]\nraised_s = nan\nsince_s = 1.0\n")
     with pytest.raises(InputError, match="nan"):
         load_recording(path)
+
+
+def test_a_part_has_the_rows_between_two_times_since_the_first_row():
+    """Two runs of ten rows at 2 Hz; the clock begins at 100 s and starts again in the second."""
+    t_s = np.concatenate([100.0 + 0.5 * np.arange(10), 0.5 * np.arange(10)])
+    rows = np.arange(20.0)
+    whole = Recording(
+        "whole",
+        t_s,
+        np.stack([rows, -rows], axis=1),
+        rows[:, None, None] * np.ones((20, 2, 3)),
+        run=np.repeat([3, 8], 10),
+        temp_C=20.0 + rows,
+        gravity=np.array([0.0, 0.0, -1.0]),
+        alarm=AlarmInfo(103.0, 102.0),
+    )
+    # The second run continues one step after the first: its rows lie at 5.0 to 9.5 s.
+    part = part_of(whole, 2.0, 6.0)
+    assert part.measured[:, 0].tolist() == list(range(4, 12))
+    assert part.temp_C.tolist() == [20.0 + row for row in range(4, 12)]
+    assert part.t_s.tolist() == [102.0, 102.5, 103.0, 103.5, 104.0, 104.5, 0.0, 0.5]
+    assert part.run.tolist() == [3] * 6 + [8] * 2
+    assert part.key_points_mm[:, 1, 2].tolist() == list(range(4, 12))
+    assert part.gravity.tolist() == [0.0, 0.0, -1.0]
+    assert part.commanded is None
+    assert part_of(whole, None, 2.0).measured[:, 0].tolist() == [0, 1, 2, 3]
+    assert part_of(whole, 9.0).measured[:, 0].tolist() == [18, 19]
+    with pytest.raises(InputError, match=r"no row from 10 s on and before inf s, .* 0 to 9\.5 s"):
+        part_of(whole, 10.0)
+    with pytest.raises(InputError, match="begins at -1 s, expected >= 0"):
+        part_of(whole, -1.0)
+    with pytest.raises(InputError, match="ends at nan s"):
+        part_of(whole, None, np.nan)
+
+
+def test_an_alarm_stays_with_its_row():
+    t_s = np.arange(10.0)
+    made = Recording("r", t_s, np.zeros((10, 1)), np.zeros((10, 1, 3)), alarm=AlarmInfo(6.0, 4.0))
+    assert part_of(made, 5.0).alarm == AlarmInfo(6.0, 4.0)
+    assert part_of(made, None, 6.0).alarm is None
+
+
+def test_the_command_writes_a_part(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    rows = np.arange(40.0)
+    made = Recording("rec", rows, rows[:, None], np.ones((40, 1, 3)), unit="mm", note="bench 2")
+    save_recording(made, tmp_path / "rec.parquet")
+    before = (tmp_path / "rec.parquet").read_bytes()
+    call = ["recording", "rec.parquet", "--from", "10", "--until", "30", "-o", "part.csv"]
+    assert surgisoft.cli.run(call) == 0
+    assert "wrote part.csv: 20 rows" in capsys.readouterr().out
+    part = load_recording("part.csv")
+    assert part.measured[:, 0].tolist() == list(range(10, 30))
+    assert (part.unit, part.note, part.name) == ("mm", "bench 2", "part")
+    for wrong, words in (
+        (["rec.parquet", "--until", "3"], "add -o PART"),
+        (["rec.parquet", "-o", "p.csv"], "add --from S, --until S or both"),
+        (["rec.parquet", "part.csv", "--from", "3", "-o", "p.csv"], "got 2 recordings"),
+        (["rec.parquet", "--from", "3", "-o", "rec.parquet", "--force"], "is the recording itself"),
+        (["rec.parquet", "--from", "3", "-o", "part.csv"], "exists already"),
+        (["rec.parquet", "--from", "99", "-o", "p.csv"], "no row from 99 s on"),
+    ):
+        assert surgisoft.cli.run(["recording", *wrong]) == 2
+        error = capsys.readouterr().err
+        assert words in error.splitlines()[-1]
+        assert error.count("surgisoft: error") == 1
+    assert not (tmp_path / "p.csv").exists()
+    assert (tmp_path / "rec.parquet").read_bytes() == before

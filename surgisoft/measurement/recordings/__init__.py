@@ -12,6 +12,7 @@ from surgisoft.measurement.recordings.file import (
     save_recording,
     save_recordings,
 )
+from surgisoft.measurement.recordings.part import part_of
 from surgisoft.measurement.recordings.predictions import with_predictions
 from surgisoft.measurement.recordings.quality import QualityWarning, find_warnings, summary
 from surgisoft.measurement.recordings.recording import (
@@ -37,6 +38,7 @@ __all__ = [
     "find_warnings",
     "load_recording",
     "load_recordings",
+    "part_of",
     "save_recording",
     "save_recordings",
     "summary",

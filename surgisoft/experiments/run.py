@@ -57,6 +57,8 @@ from surgisoft.workers import CLUSTER, check_processes, torch_threads, workers
 
 POLICY = "policy"
 """Name of a policy's digest among those of a case; those of arm models have the arms' names."""
+WITH = " with "
+"""Between an arm's name and the values of the setting, in names of such digests."""
 DROPPED = ("phase", "reason", "reason_phase", "beam", "beam_unsafe", "safe")
 """Measures of single steps whose means mean nothing."""
 
@@ -174,7 +176,9 @@ def _check_began_with(spec: Experiment, folder: Path) -> None:
             continue
         now = _case_hashes(spec, case)
         for name in (name for name in before if name in now and now[name] != before[name]):
-            what = f"the policy '{case.policy}'" if name == POLICY else f"the arm model of '{name}'"
+            arm, _, varied = name.partition(WITH)
+            of_arm = f"the arm model of '{arm}'{WITH * bool(varied)}{varied}"
+            what = f"the policy '{case.policy}'" if name == POLICY else of_arm
             kind = "policy" if name == POLICY else "model"
             raise _changed(folder, f"{what} of its case '{case.name}'", kind)
 
@@ -189,11 +193,22 @@ def _changed(folder: Path, what: str, kind: str) -> InputError:
 
 def _case_hashes(spec: Experiment, case: Case) -> dict[str, str]:
     """Digests of what acts in a case: arm's name -> that of its model, `POLICY` -> that of the
-    checkpoint of a training run."""
-    first = next(setting for setting in settings(spec) if setting.case == case)
-    plain = replace(first, case=Case("", arm=case.arm))
-    arms = build_task(spec, plain, on_warning=None).world.arms
-    hashes = {name: content_hash(arm.model) for name, arm in arms.items()}
+    checkpoint of a training run.
+
+    Where a field with text varies, such as the arm, each further combination has names of its own:
+    the arm's with `WITH`, the fields and their values.
+    """
+    hashes: dict[str, str] = {}
+    differ: dict[tuple, Setting] = {}
+    for setting in settings(spec):
+        if setting.case == case:
+            texts = tuple((f, value) for f, value in setting.values if isinstance(value, str))
+            differ.setdefault(texts, setting)
+    for texts, setting in differ.items():
+        plain = replace(setting, case=Case("", arm=case.arm))
+        varied = WITH + ", ".join(f"{f} = '{value}'" for f, value in texts) if hashes else ""
+        arms = build_task(spec, plain, on_warning=None).world.arms
+        hashes |= {name + varied: content_hash(arm.model) for name, arm in arms.items()}
     if case.policy in (*POLICIES, NOMINAL):
         return hashes
     found = RunFolder(case.policy).policy_hash

@@ -251,7 +251,7 @@ def test_each_arm_follows_the_controller_of_its_phase(phased):
     assert sorted(controllers.defined) == [("laser", "go"), ("laser", "push")]
     actions = controllers.act(task, state, {})
     part = state.world.arms["endoscope"]
-    rest = task.world.arms["endoscope"].first - part.command
+    rest = task.arms["endoscope"].first - part.command
     torch.testing.assert_close(actions["endoscope"][0], rest[0])
     laser = state.world.arms["laser"]
     torch.testing.assert_close(actions["laser"][1], 1.0 - laser.command[1])
@@ -387,6 +387,24 @@ def test_results_go_on_only_with_their_own_policy_and_arm_models(tmp_path):
             if job.setting.case.name == "ours":
                 write_json(row_file(folder, job.setting, episode), {})
     open_results(spec, folder, resume=True)
+
+
+def test_results_go_on_only_with_every_arm_model_that_varies(tmp_path):
+    """The model of the second value of `task.arm` is another one, in the same folder."""
+    first, second = tmp_path / "one", tmp_path / "two"
+    for folder in (first, second):
+        shutil.copytree(PACKAGED / "ring" / "arms" / "laser", folder)
+    vary = f'\n[[vary]]\nfield = "task.arm"\nvalues = ["{first}", "{second}"]\n'
+    spec, folder = spec_of(tmp_path, TINY + vary), tmp_path / "results"
+    open_results(spec, folder)
+    open_results(spec, folder, resume=True)
+    other = load_model(second)
+    with torch.no_grad():
+        next(iter(other.parameters())).add_(0.01)
+    save_model(other, second, force=True)
+    said = rf"the arm model of '\w+' with task\.arm = '{second}' of its case .* has changed"
+    with pytest.raises(InputError, match=said):
+        open_results(spec, folder, resume=True)
 
 
 @pytest.mark.parametrize(

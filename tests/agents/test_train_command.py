@@ -1,6 +1,8 @@
 """`surgisoft train` as one types it; several processes; every wrong turn in one line."""
 
 import json
+import re
+import shutil
 import signal
 import socket
 import sys
@@ -15,6 +17,7 @@ from surgisoft.agents.training_request import TrainingRequest
 from surgisoft.cli import run as surgisoft
 from surgisoft.errors import InputError
 from surgisoft.replay.show import find_replay
+from surgisoft.scene.spec import PHANTOM
 from surgisoft.tasks.episodes.file import load_episode
 
 SMALL = ["--task", "track_circle", "--envs", "16", "--steps", "400"]
@@ -128,6 +131,23 @@ def test_a_logger_that_cannot_be_opened_leaves_nothing(tmp_path, capsys, monkeyp
     said = capsys.readouterr().err.splitlines()
     assert said == ["surgisoft: error: --logger mlflow: cannot be opened: no server at localhost"]
     assert not folder.exists()
+
+
+def test_a_beam_beyond_the_limits_of_its_scene_is_warned_of_before_the_training(
+    tmp_path, capsys, monkeypatch
+):
+    """The training ends with its logger; what is said first is what counts here."""
+    strict = tmp_path / "strict"
+    shutil.copytree(PHANTOM, strict)
+    file = strict / "scene.toml"
+    file.write_text(re.sub(r"standoff_mm = .*", "standoff_mm = [36.0, 60.0]", file.read_text()))
+    monkeypatch.setitem(sys.modules, "mlflow", None)
+    given = ["--task", "circle_ablation", "--envs", "2", "--steps", "10", "--logger", "mlflow"]
+    run = ["-o", str(tmp_path / "run")]
+    for scene, warned in ((strict, True), (PHANTOM, False)):
+        assert surgisoft(["train", *given, "--scene", str(scene), *run]) == 2
+        said = capsys.readouterr().err
+        assert ("mm long at the ring (standoff_mm: 36 to 60)" in said) == warned, said
 
 
 def test_hyper_parameters_count_together_with_the_episodes():

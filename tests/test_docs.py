@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 from typer import BadParameter, Exit
-from typer.main import get_command
 
-from surgisoft.cli import COMMANDS, app
+from surgisoft.cli import command_line
 from surgisoft.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -54,10 +53,8 @@ def test_python_blocks_are_python(page):
 
 @pytest.mark.parametrize("page", ["README.md", "docs/commands.md"])
 def test_the_readme_and_the_list_name_every_command(page):
-    for module in COMMANDS:
-        __import__(f"surgisoft.cli.{module}")
     text = (ROOT / page).read_text()
-    for name in get_command(app).commands:
+    for name in command_line().commands:
         assert f"`surgisoft {name}" in text, name
 
 
@@ -100,9 +97,7 @@ def shell_lines(text: str):
 
 def unknown(words: list[str]) -> str | None:
     """Why the command line does not know a command or an option of a line."""
-    for module in COMMANDS:
-        __import__(f"surgisoft.cli.{module}")
-    command, context = get_command(app), None
+    command, context = command_line(), None
     try:
         while True:
             context = command.make_context(command.name, list(words), parent=context)

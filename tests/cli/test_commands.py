@@ -174,9 +174,7 @@ def test_options_of_many_values_are_spread():
 
 def _options():
     """(command, option) of every command but the long studies."""
-    from typer.main import get_command
-
-    from surgisoft.cli import with_commands
+    from surgisoft.cli import command_line
 
     def walk(path, command):
         if hasattr(command, "commands"):
@@ -187,11 +185,7 @@ def _options():
                 if option.opts[0].startswith("-"):
                     yield " ".join(path), option
 
-    return [
-        pair
-        for pair in walk((), get_command(with_commands()))
-        if not pair[0].startswith("benchmark")
-    ]
+    return [pair for pair in walk((), command_line()) if not pair[0].startswith("benchmark")]
 
 
 def test_one_name_means_one_thing_in_every_command():

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from typer.main import get_command
 
-from surgisoft.cli import run, with_commands
+from surgisoft.cli import command_line, run
 from surgisoft.errors import InputError
 from surgisoft.experiments import run as experiment_run
 from surgisoft.experiments.run import open_results, run_experiment
@@ -136,7 +135,7 @@ def _in_the_lab_without_files(lab, monkeypatch):
 
 def _leaves(path=(), command=None):
     """(name, command) of every command but the long studies."""
-    command = command or get_command(with_commands())
+    command = command or command_line()
     if not hasattr(command, "commands"):
         yield " ".join(path), command
         return

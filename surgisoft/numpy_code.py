@@ -1,6 +1,6 @@
 """PyTorch modules as NumPy source code, for programs without PyTorch.
 
-A module is traced (`torch.export`), what depends on its parameters alone is computed, and every
+A module is traced (`make_fx`), what depends on its parameters alone is computed, and every
 remaining operation becomes one line of Python. Calls of a user's Python callable stay calls: a
 graph (ONNX, TorchScript) cannot have them, and NumPy code can. The code computes with the types of
 the tensors, so that it differs from the module by rounding alone.
@@ -9,15 +9,24 @@ the tensors, so that it differs from the module by rounding alone.
 from __future__ import annotations
 
 import base64
+import contextlib
 import hashlib
 import operator
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch._subclasses import FakeTensorMode
+from torch.fx import GraphModule
+from torch.fx.experimental.proxy_tensor import make_fx
+from torch.fx.experimental.symbolic_shapes import (
+    DimDynamic,
+    ShapeEnv,
+    StatelessSymbolicContext,
+)
 
 from surgisoft.graphs import DoesNotTrace, reason_of, without_stacks
 
@@ -25,6 +34,8 @@ WRITTEN = 24
 """Most numbers of a constant that are written as such; more are written as base64."""
 LINE = 88
 """Characters of a line of base64."""
+BATCHES = (3, 7, 64, 4096)
+"""Numbers of rows for which the conditions of a trace have to hold, which has two rows."""
 LAST = 2**62
 """Ends of slices from here on are the end of the dimension."""
 
@@ -185,48 +196,79 @@ def numpy_function(
     inputs may vary. Raises DoesNotTrace for a module that cannot be traced, and for an operation
     that is not known here.
     """
-    shapes = None
-    if batched:
-        batch = torch.export.Dim("batch", min=1)
-        shapes = tuple({0: batch} for _ in example)
     try:
         with warnings.catch_warnings(), without_stacks(), torch.no_grad():
             warnings.simplefilter("ignore")
-            # Copies: one tensor given twice would become one input.
-            given = tuple(value.clone() for value in example)
-            traced = torch.export.export(
-                module, given, dynamic_shapes=shapes, strict=False
-            ).run_decompositions()
+            traced = _traced(module, example, batched)
+    except DoesNotTrace:
+        raise
     except Exception as error:
         raise DoesNotTrace(reason_of(error)) from error
     with torch.no_grad():
         return _Writer(traced, constants, inputs).function(name, first)
 
 
+def _traced(module: nn.Module, example: Sequence[Tensor], batched: bool) -> GraphModule:
+    """The core operations that a module calls; arguments as for `numpy_function`.
+
+    `torch.export` gives them after two traces and checks of parameters, in four times the time.
+    """
+    symbols = ShapeEnv()
+    fake = FakeTensorMode(shape_env=symbols, allow_non_fake_inputs=True)
+
+    def symbolic(value: Tensor) -> Tensor:
+        sizes = [DimDynamic.STATIC] * value.ndim
+        if batched:
+            sizes[0] = DimDynamic.DUCK  # first dimensions of one size are one symbol
+        context = StatelessSymbolicContext(dynamic_sizes=sizes)
+        # Copies: one tensor given twice would become one input.
+        return fake.from_tensor(value.clone(), symbolic_context=context)
+
+    def operations(*given: Tensor) -> tuple[Tensor, ...]:
+        found = module(*given)
+        return tuple(found) if isinstance(found, tuple | list) else (found,)
+
+    given = [symbolic(value) for value in example]
+    pure = torch.func.functionalize(operations, remove="mutations")
+    with fake, _compiling():
+        traced = make_fx(pure, torch.export.default_decompositions())(*given)
+    for guard in symbols.guards:
+        if not all(_holds(guard.expr, size) for size in BATCHES):
+            raise DoesNotTrace(f"its program depends on the number of rows: {guard.expr}")
+    return traced
+
+
+@contextlib.contextmanager
+def _compiling() -> Iterator[None]:
+    """`torch.compiler.is_compiling()` is true, which modules ask before they leave PyTorch."""
+    before = torch.compiler._is_compiling_flag
+    torch.compiler._is_compiling_flag = True
+    try:
+        yield
+    finally:
+        torch.compiler._is_compiling_flag = before
+
+
+def _holds(condition: Any, size: int) -> bool:
+    """Whether a condition of a trace holds for another number of rows."""
+    return bool(condition.subs(dict.fromkeys(condition.free_symbols, size)))
+
+
 class _Writer:
     """Writes one traced program as a function."""
 
-    def __init__(self, program: Any, constants: Constants, inputs: Sequence[str]):
+    def __init__(self, program: GraphModule, constants: Constants, inputs: Sequence[str]):
         self.graph, self.constants = program.graph, constants
-        signature = program.graph_signature
-        held = {**dict(program.state_dict), **dict(program.constants)}
-        targets = {
-            **signature.inputs_to_parameters,
-            **signature.inputs_to_buffers,
-            **signature.inputs_to_lifted_tensor_constants,
-        }
         self.known: dict[Any, Any] = {}
         """Values of nodes that no input changes."""
         self.text: dict[Any, str] = {}
         """Names of all other nodes in the code."""
         names = iter(inputs)
         for node in self.graph.nodes:
-            if node.op != "placeholder":
-                continue
-            if node.name in targets:
-                self.known[node] = held[targets[node.name]].detach()
-            else:
+            if node.op == "placeholder":
                 self.text[node] = next(names)
+            elif node.op == "get_attr":
+                self.known[node] = getattr(program, node.target).detach()
         self.arguments = list(inputs)
 
     def function(self, name: str, first: str) -> str:

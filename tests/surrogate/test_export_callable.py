@@ -277,6 +277,24 @@ def test_what_the_file_could_not_do_as_the_model_does_is_refused():
     assert not Path("arm").exists()
 
 
+class Crowd(Stuck):
+    """An effect that asks how many arms there are."""
+
+    def apply(self, signal, memory):
+        if len(signal) > 5:
+            return signal - self.loss * self.reach
+        return signal + 0.0 * self.loss
+
+
+def test_an_effect_that_depends_on_the_number_of_arms_is_refused():
+    """The file is traced with two arms, and compared with the model of one."""
+    crowd = Crowd(wrapped("static", ()).facts)
+    crowd.loss.data.fill_(0.3)
+    with pytest.raises(InputError, match="its program depends on the number of rows"):
+        export_arm(wrapped("static", ()).replace(effects={"crowd": crowd}), "arm")
+    assert not Path("arm").exists()
+
+
 def test_a_reopened_model_is_exported_as_the_one_that_was_saved():
     model = wrapped("static", ("gain_mismatch",))
     save_model(model, "saved")

@@ -35,6 +35,10 @@ SLOW_S = 0.3
 SLOW = Path(__file__).with_name("slow.txt")
 """The slow tests: `path::function` and the time of the slowest of its cases, s."""
 
+FIRST = ("tests/diagnosis/test_refit.py", "tests/scene/test_author.py")
+"""The files that two workers begin with: one compiles the rig, the other one the scenes. Workers
+that need the same compiled functions at the same time both compile them, where none are cached."""
+
 _TIMES: dict[str, float] = defaultdict(float)
 """Longest time of each test that has run, s."""
 _SHARED: dict[tuple[str, str], float] = {}
@@ -70,14 +74,19 @@ def pytest_collection():
 
 
 def pytest_collection_modifyitems(items):
-    """Mark each test `slow` or `fast`; put the files with the most processor time first."""
+    """Mark each test `slow` or `fast`; put FIRST and the files with the most work first."""
     slow = _slow()
     work: dict[str, float] = defaultdict(float)
     for name, time in slow.items():
         work[name.partition("::")[0]] += time
     for item in items:
         item.add_marker(pytest.mark.slow if _function(item) in slow else pytest.mark.fast)
-    items.sort(key=lambda item: -work[item.nodeid.partition("::")[0]])
+
+    def place(item) -> tuple[int, float]:
+        file = item.nodeid.partition("::")[0]
+        return (FIRST.index(file) if file in FIRST else len(FIRST), -work[file])
+
+    items.sort(key=place)
 
 
 def pytest_collection_finish():

@@ -1,6 +1,7 @@
 """From diagnosis to policy, small: what is kept and recorded, and what the page states."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from benchmarks.hidden_effect.rates import trails_s
 from benchmarks.hidden_effect.rigs import Bench, circles
 from benchmarks.hidden_effect.study import MODELS, Outcome, StudyConfig, run, worse
 from benchmarks.hidden_effect.table import draw, markdown
+from surgisoft.agents.on_rig import RigConfig
 from surgisoft.cli import run as run_command
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import load_recording
@@ -88,8 +90,10 @@ def test_a_changed_bench_is_the_rig_with_that_change(tmp_path):
 
 
 def brief(patch):
-    """Let a study look without cameras, in one recording, and in circles of a fifth of the time."""
+    """Let a study look without cameras, in one recording, and in circles of a fifth of the time,
+    and let rigs stand for an eighth of the time at each pressure before an episode."""
     patch.setattr(hidden_effect_policies, "SIGHTS", ("blind",))
+    patch.setattr(hidden_effect_policies, "RigConfig", partial(RigConfig, settle_s=0.5))
     patch.setattr(hidden_effect, "ORACLE_TAKES", 1)
     patch.setattr(
         control_policies, "config_of", lambda task: with_fields(config_of(task), loop_s=4.0)

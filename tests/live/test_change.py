@@ -244,11 +244,11 @@ def jumps(seconds, seed, factor):
 def test_fast_moves_have_a_variance_of_their_own():
     """A model that errs three times as much in fast moves as its memory along the path states.
 
-    Ten minutes hold 30 of them, and an hour raises no alarm; larger errors in them do.
+    Ten minutes hold 30 of them, and two hours raise no alarm; larger errors in them do.
     """
     found, plain = (fit([jumps(600, 20, factor)], SPAN) for factor in (3.0, 1.0))
     assert np.median(found.whitening.fast) > 3.0 * np.median(plain.whitening.fast)
-    clean, changed = jumps(3600, 21, 3.0), jumps(600, 22, 12.0)
+    clean, changed = jumps(7200, 21, 3.0), jumps(600, 22, 12.0)
     for stretch, alarms in ((clean, False), (changed, True)):
         charts = Charts(found)
         for each in zip(*stretch, strict=True):

@@ -220,7 +220,7 @@ def _traced(module: nn.Module, example: Sequence[Tensor], batched: bool) -> Grap
         sizes = [DimDynamic.STATIC] * value.ndim
         if batched:
             sizes[0] = DimDynamic.DUCK  # first dimensions of one size are one symbol
-        context = StatelessSymbolicContext(dynamic_sizes=sizes)
+        context: Any = StatelessSymbolicContext(dynamic_sizes=sizes)
         # Copies: one tensor given twice would become one input.
         return fake.from_tensor(value.clone(), symbolic_context=context)
 
@@ -230,8 +230,9 @@ def _traced(module: nn.Module, example: Sequence[Tensor], batched: bool) -> Grap
 
     given = [symbolic(value) for value in example]
     pure = torch.func.functionalize(operations, remove="mutations")
+    core: Any = torch.export.default_decompositions()
     with fake, _compiling():
-        traced = make_fx(pure, torch.export.default_decompositions())(*given)
+        traced = make_fx(pure, core)(*given)
     for guard in symbols.guards:
         if not all(_holds(guard.expr, size) for size in BATCHES):
             raise DoesNotTrace(f"its program depends on the number of rows: {guard.expr}")

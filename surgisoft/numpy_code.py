@@ -235,7 +235,10 @@ def _traced(module: nn.Module, example: Sequence[Tensor], batched: bool) -> Grap
         traced = make_fx(pure, core)(*given)
     for guard in symbols.guards:
         if not all(_holds(guard.expr, size) for size in BATCHES):
-            raise DoesNotTrace(f"its program depends on the number of rows: {guard.expr}")
+            raise DoesNotTrace(
+                f"its program depends on the number of rows ({guard.expr}), expected one program "
+                "for any number; leave out the condition"
+            )
     return traced
 
 

@@ -33,7 +33,7 @@ EVENT_WINDOW_S = (20.0, 130.0)
 """Window of time since switching on in which an event that occurs once falls [s]: in one of the
 first runs of a recording, or between them."""
 SENSOR_NOISE = 5e-4
-"""Standard deviation of one pressure reading, as a share of the upper limit [-]."""
+"""Standard deviation of one reading of the actuation, as a share of the upper limit [-]."""
 THERMOMETER_K = 0.05
 """Standard deviation of one reading of the room's temperature [K]."""
 
@@ -153,7 +153,7 @@ class Robot(Protocol):
     cameras: Cameras
     """Its cameras."""
     low: float
-    """Lower limit of pressure [Pa]."""
+    """Lower limit of actuation [SI]."""
     length_mm: float
     """Length [mm]."""
     radius_mm: float
@@ -164,9 +164,9 @@ class Moved(NamedTuple):
     """What a robot did in a run of T samples."""
 
     measured: np.ndarray
-    """(T, m) pressures at the sensors [Pa]."""
+    """(T, m) actuation at the sensors [SI]."""
     chambers: np.ndarray
-    """(T, m) pressures in the chambers [Pa]."""
+    """(T, m) actuation behind them, of the arm itself [SI]."""
     points: np.ndarray
     """(T, n, 3) key points [m]."""
     room: np.ndarray
@@ -180,6 +180,10 @@ class Bench:
     """
 
     unit = "kPa"
+    to_unit = 1e-3
+    """Actuation in `unit` of one SI unit: kPa of one Pa."""
+    to_si = 1e3
+    """Actuation in SI units of one `unit`: Pa of one kPa."""
     payload_g = None
 
     def __init__(
@@ -193,14 +197,14 @@ class Bench:
     ) -> None:
         """The bench of a robot.
 
-        high: upper limit of pressure [Pa]; gravity: (3,) in any unit; sizes: chambers and key
+        high: upper limit of actuation [SI]; gravity: (3,) in any unit; sizes: chambers and key
         points; seeds: of all noise; noise: factor on it.
         """
         self._cameras, self._high, self._noise = robot.cameras, high, noise
         self._rng = np.random.default_rng(seeds)
         self.chambers, self.key_planes = sizes
         self.period_s = robot.cameras.period_s
-        self.limits = 1e-3 * np.tile([robot.low, high], (self.chambers, 1))
+        self.limits = self.to_unit * np.tile([robot.low, high], (self.chambers, 1))
         self.arm = ArmInfo(robot.length_mm, 2.0 * robot.radius_mm)
         self.gravity = gravity / np.linalg.norm(gravity)
 
@@ -209,7 +213,7 @@ class Bench:
         raise NotImplementedError
 
     def run(self, targets: np.ndarray) -> Moved:
-        """Follow set points (T, m) [Pa], one a sample, and read after each."""
+        """Follow set points (T, m) [SI], one a sample, and read after each."""
         raise NotImplementedError
 
     def record(self, protocol: Schedule) -> tuple[Recording, Truth]:
@@ -221,7 +225,7 @@ class Bench:
         times, parts, commanded = [], [], []
         for _, commands in runs_of(protocol, self.period_s):
             times.append(self.rest() + self.period_s * np.arange(1, len(commands) + 1))
-            parts.append(self.run(1e3 * commands))
+            parts.append(self.run(self.to_si * commands))
             commanded.append(commands)
         moved = Moved(*(np.concatenate(column) for column in zip(*parts, strict=True)))
         return self._as_measured(protocol, np.concatenate(times), np.concatenate(commanded), moved)
@@ -242,13 +246,13 @@ class Bench:
             self,  # it records, and is not read
             protocol,
             t_s - t_s[0],
-            1e-3 * (moved.measured + noise * SENSOR_NOISE * self._high * draw),
+            self.to_unit * (moved.measured + noise * SENSOR_NOISE * self._high * draw),
             seen,
             commanded,
             noise_mm=float(np.sqrt(np.mean(np.square(error)))),
             temp_C=moved.room + noise * THERMOMETER_K * rng.standard_normal(len(moved.room)),
         )
-        return recording, Truth(clean, clean, 1e-3 * moved.chambers)
+        return recording, Truth(clean, clean, self.to_unit * moved.chambers)
 
 
 class Build(Protocol):

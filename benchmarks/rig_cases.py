@@ -57,7 +57,9 @@ KNOWN = {
     "twist": "twist",
     "thermal_drift": "drift",
 }
-"""Hidden effect of a generator -> the name that a diagnosis should give."""
+"""Hidden effect of every generator -> the name that a diagnosis should give."""
+FURTHER_KNOWN = {"backlash": "hysteresis", "inertia": "inertia"}
+"""The same of effects that only some generators have (`Generator.further`)."""
 ALIKE = (
     {"line_lag", "rate_dependence"},
     {"drift", "thermal_drift"},
@@ -106,8 +108,10 @@ class CaseRig(Protocol):
     """Number m of chambers."""
     key_planes: int
     """Number n of key points."""
+    unit: str
+    """Unit of the actuation, such as kPa."""
     limits: np.ndarray
-    """(m, 2) lowest and highest actuation [kPa]."""
+    """(m, 2) lowest and highest actuation [unit]."""
     period_s: float
     """Time from sample to sample [s]."""
     arm: ArmInfo
@@ -138,6 +142,8 @@ class Generator:
     schedule, for a generator that is slow."""
     longer: float = 1.0
     """Factor on the durations of all recordings, before and after a change [-]."""
+    further: tuple[str, ...] = ()
+    """Hidden effects of the rounds that are of FURTHER_KNOWN."""
 
     def duration_s(self, robot: int, name: str) -> float:
         """Duration of a recording before the change [s]; name: of BEFORE."""
@@ -169,7 +175,7 @@ class Case:
     @property
     def truth(self) -> list[str]:
         """The names that a diagnosis should give; `unknown` for effects that it does not have."""
-        return [KNOWN.get(name, "unknown") for name in self.names]
+        return [(KNOWN | FURTHER_KNOWN).get(name, "unknown") for name in self.names]
 
 
 def cases(generator: Generator, robots: list[int], count: int, seed: int) -> list[Case]:
@@ -179,7 +185,8 @@ def cases(generator: Generator, robots: list[int], count: int, seed: int) -> lis
     turn = 0
     while len(found) < count:
         pairs = [PAIRS[(PAIRS_A_ROUND * turn + k) % len(PAIRS)] for k in range(PAIRS_A_ROUND)]
-        plan = [*((name,) for name in (*KNOWN, *generator.unknown)), *pairs, *[()] * CLEAN_A_ROUND]
+        alone = (*KNOWN, *generator.further, *generator.unknown)
+        plan = [*((name,) for name in alone), *pairs, *[()] * CLEAN_A_ROUND]
         for k in rng.permutation(len(plan)):
             change = np.exp(rng.uniform(*np.log(CHANGE_MM)))
             robot = robots[(int(k) + turn) % len(robots)]
@@ -226,9 +233,8 @@ def excitation(
     """A continuous protocol of excitation signals, one run each."""
     rng = np.random.default_rng([seed, len(name), *name.encode()])
     count = round(seconds / rig.period_s)
-    return Schedule(
-        name, "continuous", *_ordered(schedule(signals, count, rig.period_s, rig.limits, rng))
-    )
+    rows = _ordered(schedule(signals, count, rig.period_s, rig.limits, rng))
+    return Schedule(name, "continuous", *rows, unit=rig.unit)
 
 
 def _ordered(parts: tuple[np.ndarray, np.ndarray, np.ndarray]) -> tuple:
@@ -287,7 +293,7 @@ def make_robot(generator: Generator, folder: Path, robot: int) -> None:
         "chambers": rig.chambers,
         "key_points": rig.key_planes,
         "length_mm": rig.arm.length_mm,
-        "high_kPa": float(rig.limits[0, 1]),
+        f"high_{rig.unit}": float(rig.limits[0, 1]),
         "period_s": rig.period_s,
         "noise_mm": noise,
     }

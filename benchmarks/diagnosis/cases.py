@@ -38,7 +38,7 @@ SAME_LAW = {
 }
 """Hidden effects -> how far the model's effect has the same law: results on them show that the
 parameters of a known law are recovered."""
-MEMORY = {"hysteresis", "rate_dependence", "line_lag", "creep", "softening", "drift"}
+MEMORY = {"hysteresis", "rate_dependence", "line_lag", "creep", "softening", "drift", "inertia"}
 """Effects that a static surrogate cannot imitate."""
 UNKNOWN = (
     "stick_slip",

@@ -4,20 +4,18 @@ import itertools
 import math
 
 from surgisoft.config import Where
-from surgisoft.measurement.recordings.columns import MM_PER
-from surgisoft.surrogate.units import KPA_PER
+from surgisoft.surrogate.units import DEGREES_PER, KPA_PER, MM_PER
 
 SECONDS_PER = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 """Seconds in each unit of time."""
 
-_DEGREES_PER = {"deg": 1.0, "rad": 57.29577951308232, "rev": 360.0}
 _VOLTS_PER = {"V": 1.0, "mV": 1e-3}
 _NEWTONS_PER = {"N": 1.0, "mN": 1e-3, "kN": 1e3}
-ACTUATION_UNITS = (*KPA_PER, *_DEGREES_PER, *_VOLTS_PER, *_NEWTONS_PER)
+ACTUATION_UNITS = (*KPA_PER, *DEGREES_PER, *_VOLTS_PER, *_NEWTONS_PER)
 """Units of pressures, angles, voltages and forces."""
 PLURAL = {"in": "inches"}
 """Units in words, where these differ from their letters."""
-_QUANTITIES = (KPA_PER, _DEGREES_PER, MM_PER, _VOLTS_PER, _NEWTONS_PER)
+_QUANTITIES = (KPA_PER, DEGREES_PER, MM_PER, _VOLTS_PER, _NEWTONS_PER)
 _ALL = (*_QUANTITIES, SECONDS_PER)
 
 

@@ -1,4 +1,4 @@
-"""Units of pressure."""
+"""Units of actuation: pressures, and the displacements of tendons and motors."""
 
 KPA_PER = {
     "Pa": 1e-3,
@@ -12,3 +12,12 @@ KPA_PER = {
     "mmHg": 0.133322387415,  # 13595.1 kg/m3 * 9.80665 m/s2 * 1 mm, NIST SP 811 (2008) B.8
 }
 """kPa in each unit of pressure."""
+MM_PER = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
+"""mm in each unit of length."""
+DEGREES_PER = {"deg": 1.0, "rad": 57.29577951308232, "rev": 360.0}
+"""Degrees in each unit of angle."""
+
+
+def is_displacement(unit: str) -> bool:
+    """Whether an actuation is how far something moves: tendons in mm, motors in degrees."""
+    return unit in MM_PER or unit in DEGREES_PER

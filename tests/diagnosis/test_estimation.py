@@ -11,6 +11,7 @@ import torch
 from scipy import stats
 
 from surgisoft.diagnosis.candidates import with_effect
+from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.diagnosis.estimation import network_error
 from surgisoft.diagnosis.estimation.effects import fit_effects, fitted_model
 from surgisoft.diagnosis.estimation.intervals import (
@@ -104,6 +105,23 @@ TRUTHS = {
     "misalignment": with_truth("misalignment", {"turn": [0.02, 0.0, -0.01], "shift": [0.3, 0, 1]}),
 }
 """An arm for each effect that is tried: one a stage and kind of memory."""
+
+
+@pytest.mark.parametrize(("unit", "named"), [("mm", True), ("deg", True), ("kPa", False)])
+def test_what_is_held_in_place_relaxes_and_a_chamber_does_not_creep_backwards(unit, named):
+    """A tendon of constant pull loses a share of its push with time (a standard linear solid)."""
+    arm = bare_arm()
+    arm = arm.replace(spec=replace(arm.spec, unit=unit))
+    truth = with_truth("creep", {"amount": [-0.15], "log_tau": [2.0], "log_width": [0.3]})
+    recorded = replace(measured_on(truth), unit=unit)
+    found = diagnose(arm, [recorded], setup_tests=False, refit="never")
+    assert (found.verdict.effects == ("creep",)) == named
+    row = next((each for each in found.ranking if each.effect == "creep"), None)
+    if named:
+        assert row.parameters["amount_share"] == pytest.approx(-0.15, rel=0.2)
+        assert "-" in row.in_words
+    else:
+        assert row is None or row.confidence < 0.1
 
 
 def rms(residual: np.ndarray) -> float:

@@ -2,8 +2,8 @@
 
 import pytest
 
-from surgisoft.measurement.recordings.columns import MM_PER
 from surgisoft.measurement.units import SECONDS_PER, factor, same_unit, unit_mistakes, unit_named
+from surgisoft.surrogate.units import MM_PER
 
 VALUES = [
     ("in", "mm", 25.4),

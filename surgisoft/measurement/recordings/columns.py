@@ -4,9 +4,7 @@ import re
 from dataclasses import dataclass
 
 from surgisoft.errors import InputError
-
-MM_PER = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
-"""Millimetres in each unit that key points may come in."""
+from surgisoft.surrogate.units import MM_PER
 
 _UNIT = r"([A-Za-z%][A-Za-z0-9%]*)"
 _ACTUATION = re.compile(rf"([pc])([1-9][0-9]{{0,5}})_{_UNIT}")

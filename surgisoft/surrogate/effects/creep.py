@@ -9,6 +9,11 @@ solids. A narrow spectrum is a single time, a wide one the power law t^n (Findle
     x_eff = x + amount sum_k w_k z_k,               x = load, 0 at rest and 1 at full actuation.
 
 The load is held between two rows, and each element is integrated exactly.
+
+Under a constant pressure or force the wall gives way further: the amount is positive. Under a
+constant displacement, such as the pull of a tendon in mm, the wall and the tendon relax and the arm
+goes back (Findley 1976, ch. 5): the amount is negative. There both signs are plausible, because the
+body beside the tendons may creep, too.
 """
 
 import torch
@@ -27,6 +32,7 @@ from surgisoft.surrogate.effects.base import (
 from surgisoft.surrogate.effects.hypothesis import Hypothesis
 from surgisoft.surrogate.effects.readings import Reading, duration
 from surgisoft.surrogate.scan import linear_scan
+from surgisoft.surrogate.units import is_displacement
 
 TIMES = torch.logspace(-0.45, 2.55, 11, dtype=torch.float64)
 """(K,) retardation times, 0.35 to 350 s, a factor of 2 apart."""
@@ -112,9 +118,11 @@ class Creep(Effect):
 
     def quantities(self) -> list[Quantity]:
         """Amount, centre (s) and width of the spectrum, and the power of the load."""
-        rubber = "wide: at most as much again as at once; a solid does not creep backwards"
+        moved = is_displacement(self.facts.unit)
+        why = "wide: at most as much again as at once" if not moved else "wide: at most all of it"
+        why += "; a solid does not creep backwards" if not moved else " is lost, or as much again"
         return [
-            Quantity("amount_share", value_of(self.amount), "", 0.0, 1.0, rubber),
+            Quantity("amount_share", value_of(self.amount), "", -1.0 if moved else 0.0, 1.0, why),
             Quantity(
                 "tau_s",
                 value_of(self.log_tau.exp()),

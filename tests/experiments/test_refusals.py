@@ -251,7 +251,7 @@ def test_each_arm_follows_the_controller_of_its_phase(phased):
     assert sorted(controllers.defined) == [("laser", "go"), ("laser", "push")]
     actions = controllers.act(task, state, {})
     part = state.world.arms["endoscope"]
-    rest = task.arms["endoscope"].first - part.command
+    rest = task.world.arms["endoscope"].first - part.command
     torch.testing.assert_close(actions["endoscope"][0], rest[0])
     laser = state.world.arms["laser"]
     torch.testing.assert_close(actions["laser"][1], 1.0 - laser.command[1])

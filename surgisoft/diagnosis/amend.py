@@ -91,6 +91,11 @@ class Fall:
         return self.ci95[0] > 0 and self._matters and not self._by_chance
 
     @property
+    def rises(self) -> bool:
+        """Whether the new model errs more: the 95 % interval of the fall lies below zero."""
+        return self.ci95[1] < 0
+
+    @property
     def _matters(self) -> bool:
         room = max(self.before - self.floor, 0.1 * self.before)
         return self.fall >= LEAST_FALL * room
@@ -203,8 +208,11 @@ class Amendment:
         A network that is trained on together with the effects does not see the held-out rows. If
         the given model had been fitted to some of them, its error there is no test, and what counts
         is the network that was trained on from the same weights for as long without the effects:
-        that comparison is claimed, and no error on unseen data.
+        that comparison is claimed, and no error on unseen data. Nothing is claimed where the change
+        is explained but the model itself errs more.
         """
+        if self.model_error is not None and self.model_error.rises:
+            return False
         if self._seen_before:
             return self.alone.significant
         return self.alone.claimed and self.held_out.claimed
@@ -221,7 +229,8 @@ class Amendment:
             return f"{' + '.join(self.effects)}: {self._together}"
         text = f"{' + '.join(self.effects)}: {self.alone.sentence}"
         if self.model_error is not None:
-            text = of_change(text, self.change, self.model_error)
+            change = of_change(self.alone, self.change, self.model_error)
+            text = f"{' + '.join(self.effects)}: {change}"
             return f"{text}, its network's last layer re-tuned" if self.retuned else text
         if not self.retuned:
             return text
@@ -481,11 +490,20 @@ def _fall(before: np.ndarray, after: np.ndarray, count: np.ndarray) -> np.ndarra
     return np.sqrt(before / count) - np.sqrt(after / count)
 
 
-def of_change(sentence: str, change: Change | None, whole: Fall) -> str:
+def of_change(fall: Fall, change: Change | None, whole: Fall) -> str:
     """The sentence of a fall of the paired difference, with the model's own error beside it."""
     since = f" since {' + '.join(change.before)}" if change is not None else ""
-    text = sentence.replace("error ", f"unexplained change{since} ", 1)
-    return f"{text}; error of the model itself {whole.before:.3f} to {whole.after:.3f} mm"
+    text = fall.sentence.replace("error ", f"unexplained change{since} ", 1)
+    own = f"{whole.before:.3f} to {whole.after:.3f} mm"
+    if not (whole.rises and fall.claimed):
+        return f"{text}; error of the model itself {own}"
+    low, high = whole.ci95
+    return (
+        f"{text}, but no reduction of the error is claimed, because the model itself errs more: "
+        f"{own} on held-out data (rise {-whole.fall:.3f} mm, 95 % {-high:.3f} to {-low:.3f}); its "
+        "own error and the change cancel in part: first lower its error on the recordings from "
+        "before the change ('surgisoft improve MODEL BEFORE -o NEW', or fit it again)"
+    )
 
 
 def track_of(before: Problem, after: Problem) -> Track:

@@ -195,7 +195,10 @@ class Improvement:
         Where the given model had been fitted to held-out rows, its error there is smaller than on
         data that took no part. A network that was trained on together with effects is compared with
         it all the same, and with the network alone in its round; any other fall is not claimed.
+        Nothing is claimed where the change is explained but the model itself errs more.
         """
+        if self.model_error is not None and self.model_error.rises:
+            return False
         if self.held_out.in_fit and any(done.together for done in self.rounds):
             return bool(self.steps) and self.held_out.significant
         return bool(self.steps) and self.held_out.claimed
@@ -214,7 +217,7 @@ class Improvement:
             )
         text = fall.sentence
         if self.model_error is not None:
-            text = of_change(text, self.change, self.model_error)
+            text = of_change(fall, self.change, self.model_error)
         return f"{names}: {text}"
 
     def to_json(self) -> dict:

@@ -131,6 +131,25 @@ def test_with_recordings_from_before_only_what_has_changed_is_added(tmp_path, ca
     assert "Change that is not explained" in (tmp_path / "report.html").read_text()
 
 
+def test_a_model_that_errs_more_after_the_change_is_explained_is_not_claimed(tmp_path, capsys):
+    """The frame was turned before and is straight now, as the model has it."""
+    before, after = measured_on(TRUTHS["misalignment"]), measured_on(bare_arm(), noise_seed=5)
+    save_model(bare_arm(), tmp_path / "arm")
+    save_recording(replace(before, name="before"), tmp_path / "before.parquet")
+    save_recording(replace(after, name="after"), tmp_path / "after.parquet")
+    earlier = ["--before", str(tmp_path / "before.parquet"), "-o", str(tmp_path / "new")]
+    data = [str(tmp_path / "arm"), "--data", str(tmp_path / "after.parquet")]
+    assert run(["amend", *data, "--effect", "misalignment", *earlier]) == 1
+    out = capsys.readouterr().out
+    assert "misalignment: unexplained change since before reduced from" in out
+    assert "no reduction of the error is claimed, because the model itself errs more" in out
+    assert not (tmp_path / "new").exists()
+    assert run(["improve", *data[::2], *earlier]) == 1
+    out = capsys.readouterr().out
+    assert "no reduction of the error is claimed, because the model itself errs more" in out
+    assert not (tmp_path / "new").exists()
+
+
 def test_recordings_from_before_and_a_refit_exclude_each_other():
     recording = measured_on(bare_arm(), rows=200)
     with pytest.raises(InputError, match="leave out one of the two"):

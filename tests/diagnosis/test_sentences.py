@@ -137,6 +137,29 @@ def test_a_fall_is_claimed_where_it_is_certain_large_and_due_to_the_effects():
     assert changed.sentence.endswith("2.000 to 1.500 mm, its network's last layer re-tuned")
 
 
+def test_nothing_is_claimed_where_the_model_itself_errs_more():
+    """The change is explained, and the model's own error had cancelled it in part."""
+    worse = fall(0.7, 0.9, ci95=(-0.3, -0.05))
+    changed = amendment(change=CHANGE, model_error=worse)
+    assert not changed.claimed
+    assert (
+        "unexplained change since monday + tuesday reduced from 0.500 to 0.200 mm on held-out data"
+        in changed.sentence
+    )
+    assert (
+        "but no reduction of the error is claimed, because the model itself errs more: 0.700 to "
+        "0.900 mm on held-out data (rise 0.200 mm, 95 % 0.050 to 0.300)" in changed.sentence
+    )
+    unclear = amendment(change=CHANGE, model_error=fall(0.7, 0.9, ci95=(-0.3, 0.05)))
+    assert unclear.claimed
+    assert unclear.sentence.endswith("; error of the model itself 0.700 to 0.900 mm")
+    rounds = (SimpleNamespace(step="creep", error_mm=0.2),)
+    found = Improvement(None, rounds, (), fall(), (None, None), 1.0, change=CHANGE)
+    assert found.claimed
+    assert not replace(found, model_error=worse).claimed
+    assert "the model itself errs more" in replace(found, model_error=worse).sentence
+
+
 def test_an_improvement_says_what_was_added():
     rounds = (SimpleNamespace(step="creep", error_mm=0.2), SimpleNamespace(step=None, error_mm=0.2))
     found = Improvement(None, rounds, (), fall(), (None, None), 1.0)

@@ -46,7 +46,10 @@ def show_parameters(parameters, in_words: dict[str, str]) -> None:
         if not each.plausible:
             low, high = each.plausible_range
             unit = f" {each.unit}" if each.unit else ""
+            reaches = ""
+            if each.may_be_plausible:
+                reaches = "; the 95 % interval reaches plausible values"
             print(
                 f"implausible: {each.effect} {each.name} = {values_text(each.value)}, expected "
-                f"{values_text(low)} to {values_text(high)}{unit} ({each.source})"
+                f"{values_text(low)} to {values_text(high)}{unit} ({each.source}){reaches}"
             )

@@ -305,6 +305,7 @@ def improve(
         problem = both.table.training()
         asked = both.training()
     is_paired = both is not None and both.used
+    own = table.training()
     made, rounds = [_Made(model, model)], []
     diagnoses: list[Diagnosis] = []
     added: list[str] = []
@@ -375,6 +376,9 @@ def improve(
         if not doubt and isinstance(fitted, JointFit):
             alone, both_ = (problem.with_model(each) for each in (fitted.alone, fitted.model))
             doubt = _idle(name, fall_of(alone, both_))
+        if not doubt and is_paired and added:
+            of_model = [own.with_model(each) for each in (made[-1].model, fitted.model)]
+            doubt = _harmful(name, fall_of(*of_model))
         tried = _Tried(name, fitted, fall, doubt)
         if tried.strange and isinstance(fitted, Fitted):
             held = fit_plausible(posed, fitted, [*added, name], name)
@@ -579,6 +583,22 @@ def _idle(name: str, fall: Fall) -> str:
     if fall.significant:
         return ""
     return f"the network alone, trained for as many epochs as with {name}, lowers the error as far"
+
+
+def _harmful(name: str, fall: Fall) -> str:
+    """Why an effect that explains some of a change is not added to others; empty if it may be.
+
+    The first effect of a change is added even where it cancels an error of the model: it tells what
+    has changed. Little of the change is left for a further one, and the model is to gain by it.
+
+    fall: of the error of the model itself on the training rows.
+    """
+    if fall.fall >= 0.0:
+        return ""
+    return (
+        f"{name} explains some of the change, and the model itself errs more with it: "
+        f"{fall.before:.3f} to {fall.after:.3f} mm on the training part"
+    )
 
 
 def _interrupted(steps: list[Round]) -> Round:

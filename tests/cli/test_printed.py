@@ -300,10 +300,10 @@ def test_the_page_of_a_diagnosis_has_the_command_that_is_printed(
 
 PARAMETER = SimpleNamespace(
     effect="creep", name="tau", unit="s", interval_text="2 to 4", value=3.0, plausible=False,
-    plausible_range=(5.0, 9.0), source="Smith 2001", before=None,
+    plausible_range=(5.0, 9.0), source="Smith 2001", before=None, may_be_plausible=False,
 )  # fmt: skip
 UNITLESS = SimpleNamespace(**(vars(PARAMETER) | {"unit": "", "interval_text": "", "name": "share"}))
-HAD = SimpleNamespace(**(vars(PARAMETER) | {"before": 2.5}))
+HAD = SimpleNamespace(**(vars(PARAMETER) | {"before": 2.5, "may_be_plausible": True}))
 
 
 def test_amend_and_improve_write_nothing_where_nothing_is_claimed(
@@ -348,6 +348,7 @@ def test_amend_and_improve_write_nothing_where_nothing_is_claimed(
     )  # fmt: skip
     assert "creep: the model had this effect already; its parameters were fitted again\n" in out
     assert "  creep: tau = 3 s (2 to 4), before 2.5 s\n" in out
+    assert "(Smith 2001); the 95 % interval reaches plausible values\n" in out
     assert "which lowers the error of the quarters of the training part that were left o" in out
     assert "creep lowers it, with parts of the training data left out\n" in out
     assert f"{new} was not written; --anyway writes it nevertheless" in out

@@ -150,6 +150,20 @@ def test_a_model_that_errs_more_after_the_change_is_explained_is_not_claimed(tmp
     assert not (tmp_path / "new").exists()
 
 
+def test_a_further_effect_with_which_the_model_errs_more_is_not_added(monkeypatch):
+    """The frame was turned before and is straight now, as the model has it; gains have changed."""
+    heard = [said("identified", name) for name in ("gain_mismatch", "misalignment", "creep")]
+    monkeypatch.setattr(loop, "diagnose_change", lambda *_: heard.pop(0))
+    before = measured_on(TRUTHS["misalignment"], rows=200)
+    gains = with_truth("gain_mismatch", {"gain": [0.16, -0.12, -0.05]})
+    found = improve(bare_arm(), [measured_on(gains, rows=200, noise_seed=5)], before=[before])
+    assert [r.step for r in found.rounds] == ["gain_mismatch", None]
+    why = "; but misalignment explains some of the change, and the model itself errs more with it"
+    assert why in found.rounds[-1].sentence
+    turned = before.key_points_mm - measured_on(bare_arm(), rows=200).key_points_mm
+    assert found.model_error.after < rms_distance(turned), "the frame of the model is that of now"
+
+
 def test_recordings_from_before_and_a_refit_exclude_each_other():
     recording = measured_on(bare_arm(), rows=200)
     with pytest.raises(InputError, match="leave out one of the two"):

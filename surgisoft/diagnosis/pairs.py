@@ -47,6 +47,7 @@ from surgisoft.diagnosis.residuals import (
     residual_table,
 )
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.measurement.histories import faster_in_words, speed_of_runs
 from surgisoft.measurement.recordings import Recording
 
 WINDOW_S = 20.0
@@ -1188,25 +1189,51 @@ class BeforeAfter:
                 "changed there is not explained; --paired auto explains the model's residuals on "
                 "all rows",
             )
+        return (self._why_unpaired(instead), *self._faster)
+
+    @property
+    def _faster(self) -> tuple[str, ...]:
+        """That AFTER moves faster than BEFORE, from which the model's error is learned; empty where
+        most rows repeat motion of BEFORE."""
+        if self.pairs.paired[~self.table.held_out].mean() >= LEAST_SHARE:
+            return ()
+        faster = faster_in_words(_speed(self.plain), _speed(self.earlier), self.names)
+        if not faster:
+            return ()
+        return (
+            f"{faster}: what the model lacks at this speed was not seen there and counts as a "
+            "change; record motion as fast as this before the change, too",
+        )
+
+    def _why_unpaired(self, instead: str) -> str:
+        """Why rows are not paired, and what is done instead."""
         if self.asked == "never":
-            return (f"rows are not paired, because --paired never was given: {instead}",)
+            return f"rows are not paired, because --paired never was given: {instead}"
         same = f"were recorded with the same actuation as {self.names}"
         again = "record the same protocol before and after"
         if self.unchecked:
             share = float(self.pairs.paired[self.plain.held_out].mean())
             return (
                 f"{100 * share:.0f} % of the held-out rows {same}, too few to check an amendment "
-                f"of the change on them: {instead}; {again}",
+                f"of the change on them: {instead}; {again}"
             )
         share = float(self.pairs.paired[~self.table.held_out].mean())
         if share >= LEAST_SHARE:
             return (
                 f"{100 * share:.0f} % of the rows {same}, but these are fewer than the "
-                f"{LEAST_ROWS} that a paired difference needs: {instead}; record for longer",
+                f"{LEAST_ROWS} that a paired difference needs: {instead}; record for longer"
             )
         few = _enough(self.plain, self.pairs, asked=True)
         alone = ", or explain the change in these rows alone by --paired always" if few else ""
-        return (f"{100 * share:.0f} % of the rows {same}: {instead}; {again}{alone}",)
+        return f"{100 * share:.0f} % of the rows {same}: {instead}; {again}{alone}"
+
+
+def _speed(table: ResidualTable) -> float:
+    """Speed of the actuation of a table (`speed_of_runs`), 1/s."""
+    timed = np.flatnonzero(table.timed)
+    runs = np.split(timed, np.flatnonzero(np.diff(table.run[timed])) + 1)
+    span = np.asarray(table.spec.span)
+    return speed_of_runs((table.t_s[rows], table.pressure[rows] / span) for rows in runs)
 
 
 def before_and_after(

@@ -1,5 +1,6 @@
 """Recordings as the tensors that arm models are fitted to and evaluated on."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -146,19 +147,40 @@ def speed_of(
     moves most; span: (m,) range of each chamber, in the recordings' unit. 0 where recordings have
     steady states alone.
     """
+    runs = [
+        (recording.t_s[run], actuation_of(recording, actuation)[run] / np.asarray(span))
+        for recording in recordings
+        if recording.kind != "settled"
+        for run in recording.runs
+    ]
+    return speed_of_runs(runs)
+
+
+def speed_of_runs(runs: Iterable[tuple[np.ndarray, np.ndarray]]) -> float:
+    """The speed of `speed_of` of runs, each as its times (T,), s, and its actuation (T, m) as a
+    share of its range."""
     found = [np.zeros(1)]
-    for recording in recordings:
-        if recording.kind == "settled":
-            continue
-        signal = actuation_of(recording, actuation) / np.asarray(span)
-        for run in recording.runs:
-            t_s, x = recording.t_s[run], signal[run]
-            later = np.searchsorted(t_s, t_s + SPEED_S)
-            rows = np.flatnonzero(later < len(t_s))
-            later = later[rows]
-            moved = np.abs(x[later] - x[rows]).max(axis=1) / (t_s[later] - t_s[rows])
-            found.append(moved)
+    for t_s, x in runs:
+        later = np.searchsorted(t_s, t_s + SPEED_S)
+        rows = np.flatnonzero(later < len(t_s))
+        later = later[rows]
+        moved = np.abs(x[later] - x[rows]).max(axis=1) / (t_s[later] - t_s[rows])
+        found.append(moved)
     return float(np.quantile(np.concatenate(found), SPEED_QUANTILE))
+
+
+def faster_in_words(came: float, known: float, there: str) -> str:
+    """That an actuation moves faster than elsewhere, in words; empty unless `FASTER` times as fast.
+
+    came, known: its speed here and there, 1/s; there: these recordings in words.
+    """
+    if came <= FASTER * known:
+        return ""
+    slow = f"and {there} have steady states alone"
+    if known:
+        slow = f"{came / known:.2g} times as fast as in {there}"
+    percent = float(f"{100 * came:.2g}")
+    return f"the actuation moves by {percent:g} % of its range in a second, {slow}"
 
 
 def faster_than_fit(spec: ArmSpec, recordings: list[Recording]) -> list[str]:
@@ -166,18 +188,12 @@ def faster_than_fit(spec: ArmSpec, recordings: list[Recording]) -> list[str]:
     if spec.speed_per_s is None:
         return []
     came = speed_of(recordings, spec.span, spec.actuation)
-    if came <= FASTER * spec.speed_per_s:
+    faster = faster_in_words(came, spec.speed_per_s, "the recordings of the fit")
+    if not faster:
         return []
-    slow = (
-        f"{came / spec.speed_per_s:.2g} times as fast as in the recordings of the fit"
-        if spec.speed_per_s
-        else "and the recordings of the fit have steady states alone"
-    )
-    percent = float(f"{100 * came:.2g}")
     return [
-        f"the actuation moves by {percent:g} % of its range in a second, {slow}: the model may "
-        "have lacked effects of speed from the start; fit it to motion as fast as this, too "
-        "('surgisoft diagnose' tells what has changed since the fit)"
+        f"{faster}: the model may have lacked effects of speed from the start; fit it to motion as "
+        "fast as this, too ('surgisoft diagnose' tells what has changed since the fit)"
     ]
 
 

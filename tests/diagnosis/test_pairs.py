@@ -749,6 +749,23 @@ def test_nothing_is_paired_where_pairs_are_not_wanted(model):
     assert "record" not in note
 
 
+def test_motion_faster_than_before_is_noted_where_rows_are_not_paired(model):
+    """What the model lacks at this speed cannot be learned from slower motion."""
+    walk = smooth_walk(3)
+    slow = made(lambda t_s: walk(0.25 * t_s), 0.0, seed=2, name="earlier")
+    fast = made(walk, 0.0, name="later")
+    change = before_and_after(residual_table(model, [fast]), [slow])
+    span = model.spec.span
+    ratio = speed_of([fast], span) / speed_of([slow], span)
+    assert ratio > 2.0
+    _, note = change.notes
+    assert f"% of its range in a second, {ratio:.2g} times as fast as in earlier: " in note
+    assert "counts as a change" in note
+    assert note in change.notes_of_fit
+    assert len(before_and_after(residual_table(model, [slow]), [fast]).notes) == 1
+    assert not before_and_after(residual_table(model, [fast]), [replace(fast)]).notes
+
+
 def test_an_amendment_of_few_pairs_is_checked_where_they_are_asked_for(model):
     """One of three recordings repeats BEFORE: a third of the held-out rows has a partner."""
     motion, rows = smooth_walk(3), round(120.0 / PERIOD_S)

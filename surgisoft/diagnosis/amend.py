@@ -208,11 +208,9 @@ class Amendment:
         A network that is trained on together with the effects does not see the held-out rows. If
         the given model had been fitted to some of them, its error there is no test, and what counts
         is the network that was trained on from the same weights for as long without the effects:
-        that comparison is claimed, and no error on unseen data. Nothing is claimed where the change
-        is explained but the model itself errs more.
+        that comparison is claimed, and no error on unseen data. Of paired recordings the change is
+        what is explained, also where the model itself errs more (`errs_more`).
         """
-        if self.model_error is not None and self.model_error.rises:
-            return False
         if self._seen_before:
             return self.alone.significant
         return self.alone.claimed and self.held_out.claimed
@@ -437,6 +435,7 @@ def amend(
     shown = fitted.model if is_paired else better
     falls = [(part, part.with_model(shown)) for part in (problem, held_out)]
     tested = alone.p_value if judged is None and not retuned else None
+    model_error = fall_of(whole, whole.with_model(better)) if is_paired else None
     return Amendment(
         model=better,
         effects=tuple(names),
@@ -448,9 +447,9 @@ def amend(
         retuned=retuned,
         tracks=(track_of(*falls[0]), track_of(*falls[1])),
         seconds=time.perf_counter() - begin,
-        notes=notes,
+        notes=(*notes, *errs_more(model_error)),
         change=None if both is None else both.change,
-        model_error=fall_of(whole, whole.with_model(better)) if is_paired else None,
+        model_error=model_error,
         refit=judged,
         amended_from=given,
         recordings=tuple(each.name for each in recordings),
@@ -494,15 +493,27 @@ def of_change(fall: Fall, change: Change | None, whole: Fall) -> str:
     """The sentence of a fall of the paired difference, with the model's own error beside it."""
     since = f" since {' + '.join(change.before)}" if change is not None else ""
     text = fall.sentence.replace("error ", f"unexplained change{since} ", 1)
-    own = f"{whole.before:.3f} to {whole.after:.3f} mm"
-    if not (whole.rises and fall.claimed):
-        return f"{text}; error of the model itself {own}"
+    more = ", which is more" if whole.rises else ""
+    return f"{text}; error of the model itself {whole.before:.3f} to {whole.after:.3f} mm{more}"
+
+
+def errs_more(whole: Fall | None) -> tuple[str, ...]:
+    """A note where a model with the effects of a change errs more than the given one; else none.
+
+    The effects are those of the change all the same: the network's own error is not in the paired
+    difference that they were fitted to, and had cancelled the change in part.
+
+    whole: of the error of the model itself on the held-out rows; None without pairs.
+    """
+    if whole is None or not whole.rises:
+        return ()
     low, high = whole.ci95
     return (
-        f"{text}, but no reduction of the error is claimed, because the model itself errs more: "
-        f"{own} on held-out data (rise {-whole.fall:.3f} mm, 95 % {-high:.3f} to {-low:.3f}); its "
-        "own error and the change cancel in part: first lower its error on the recordings from "
-        "before the change ('surgisoft improve MODEL BEFORE -o NEW', or fit it again)"
+        f"the new model itself errs more than the given one on the held-out rows: "
+        f"{whole.before:.3f} to {whole.after:.3f} mm (rise {-whole.fall:.3f} mm, 95 % "
+        f"{-high:.3f} to {-low:.3f}). The given model's own error and the change cancel in part. "
+        "To predict this arm, first lower that error on the recordings from before the change "
+        "('surgisoft improve MODEL BEFORE -o OTHER', or fit the model again), then amend",
     )
 
 

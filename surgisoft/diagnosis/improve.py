@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 
-from surgisoft.diagnosis.amend import Fall, Track, fall_of, of_change, track_of
+from surgisoft.diagnosis.amend import Fall, Track, errs_more, fall_of, of_change, track_of
 from surgisoft.diagnosis.amended_error import state_error, state_residuals
 from surgisoft.diagnosis.data_quality import collinear_hints
 from surgisoft.diagnosis.diagnose import (
@@ -195,10 +195,7 @@ class Improvement:
         Where the given model had been fitted to held-out rows, its error there is smaller than on
         data that took no part. A network that was trained on together with effects is compared with
         it all the same, and with the network alone in its round; any other fall is not claimed.
-        Nothing is claimed where the change is explained but the model itself errs more.
         """
-        if self.model_error is not None and self.model_error.rises:
-            return False
         if self.held_out.in_fit and any(done.together for done in self.rounds):
             return bool(self.steps) and self.held_out.significant
         return bool(self.steps) and self.held_out.claimed
@@ -482,6 +479,7 @@ def improve(
     new = [effect for name, effect in final_model.effects.items() if name in added]
     if any(effect.stage in FRONT for effect in new):
         notes = (*notes, *collinear_hints(table))
+    model_error = fall_of(whole, whole.with_model(final_model)) if is_paired else None
     result = Improvement(
         model=final_model,
         rounds=tuple(shown),
@@ -489,12 +487,12 @@ def improve(
         held_out=fall_of(held_out, final),
         tracks=(track_of(problem, problem.with_model(final_model)), track_of(held_out, final)),
         seconds=time.perf_counter() - begin,
-        notes=notes,
+        notes=(*notes, *errs_more(model_error)),
         diagnoses=tuple(diagnoses),
         amended_from=given,
         recordings=tuple(each.name for each in recordings),
         change=None if both is None else both.change,
-        model_error=fall_of(whole, whole.with_model(final_model)) if is_paired else None,
+        model_error=model_error,
         in_words=words,
     )
     if result.held_out.claimed:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from surgisoft.diagnosis.amend import Amendment, Fall, Track
+from surgisoft.diagnosis.amend import Amendment, Fall, Track, errs_more
 from surgisoft.diagnosis.diagnose import Diagnosis
 from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
 from surgisoft.diagnosis.improve import NETWORK, Improvement, Round
@@ -75,7 +75,7 @@ def amend_page(result: Amendment, title: str, about: str) -> Page:
         title=title,
         verdict=result.sentence,
         about=about,
-        tone="good" if result.claimed else "warn",
+        tone="good" if result.claimed and not errs_more(result.model_error) else "warn",
         parts=[
             facts,
             Section("Parameters", parameter_parts(result)),
@@ -251,7 +251,8 @@ def improve_page(
     if result.diagnoses:
         parts.append(what_is_left(result, command))
     parts.append(Section("How to read this", how_to_read(fall)))
-    tone = "good" if result.claimed else "warn"
+    good = result.claimed and not errs_more(result.model_error)
+    tone = "good" if good else "warn"
     return Page(title=title, verdict=result.sentence, about=about, tone=tone, parts=parts)
 
 

@@ -170,7 +170,10 @@ def compare(
         since += model_options(predictions, its_error)
         following = with_effect_files(f"surgisoft diagnose {typed(models[best])} {names}{since}")
         closest = " from the model of the smallest error" if others else ""
-        print(f"next, which effect is missing{closest}: {following}")
+        asked = "which effect is missing"
+        if compared[best].result.of_another_arm:
+            asked = "whether one effect explains most of it"
+        print(f"next, {asked}{closest}: {following}")
 
 
 def _values(compared) -> dict:

@@ -22,10 +22,13 @@ from surgisoft.diagnosis.other_models import name_of, open_model, takes_error
 from surgisoft.diagnosis.pairs import Change, Paired, before_and_after
 from surgisoft.diagnosis.residuals import (
     LEAST_BLOCKS,
+    WHOSE_ARM,
     Floor,
+    ModelFit,
     Part,
     Problem,
     ResidualTable,
+    model_fit,
     repeat_floor,
     residual_table,
     with_training_noise,
@@ -141,6 +144,14 @@ class Comparison:
     It is the error that `diagnose` states."""
     part: Part = "all"
     """The rows that were looked at."""
+    of_arm: ModelFit | None = None
+    """How well the model describes the arm: its error beside the motion of the key points."""
+
+    @property
+    def of_another_arm(self) -> bool:
+        """Whether the model leaves so much of the motion that it does not describe this arm, and no
+        fault of the set-up is proved. What the error depends on then says nothing."""
+        return self.of_arm is not None and not self.of_arm.fits and self.setup is None
 
     @property
     def explainable(self) -> float | None:
@@ -182,6 +193,11 @@ class Comparison:
             text = f"{self.change.sentence}; {text}"
         if self.at_floor:
             return f"{text}: the error is at the floor"
+        if self.of_another_arm and self.of_arm is not None:
+            return (
+                f"{text}: the model does not describe this arm's motion of "
+                f"{_mm(self.of_arm.motion_mm)}: {WHOSE_ARM}"
+            )
         if self.best_achievable is None or self.open_rmse_mm is None:
             return f"{text}; too few rows to say what it depends on"
         if self.part == "all":
@@ -318,6 +334,7 @@ def compare(
             in_fit=problem.in_fit,
             open_rmse_mm=None if best is None else posed.rmse_mm,
             part=part,
+            of_arm=model_fit(table),
         ),
         table,
     )

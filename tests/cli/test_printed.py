@@ -62,6 +62,7 @@ def comparison(name: str, **fields) -> SimpleNamespace:
         "components_mm": {"x": 0.1, "y": 0.2}, "mse_mm2": 0.25, "per_key_point_mm": [0.25, NAN],
         "coverage": None, "time_shift": None, "axes": (), "change_axes": (), "worst": (),
         "explainable": None, "rmse_ci95_mm": (0.4, 0.6), "in_fit": 0.0, "rows_of_fit": "",
+        "of_another_arm": False,
     }  # fmt: skip
     table = SimpleNamespace(model=SimpleNamespace(summary=lambda: "an arm"))
     numbers = result(**(values | fields))

@@ -5,10 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from surgisoft.cli import run
+from surgisoft.diagnosis.compare import compare
 from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.diagnosis.improve import next_effects
 from surgisoft.diagnosis.residuals import ModelFit, fit_of_model
 from surgisoft.errors import InputError
+from surgisoft.measurement.recordings import save_recording
 from surgisoft.surrogate.checkpoint import default_arm
 from surgisoft.surrogate.model import Validation
 from tests.diagnosis.setup.recordings import NOISE_MM, measured, predicted, with_points
@@ -39,6 +42,32 @@ def test_a_model_of_this_arm_predicts_most_of_its_motion(model, share, fits):
     found = fit_of_model(model, [away])
     assert found.rmse_mm == pytest.approx(share * motion, rel=1e-3)
     assert found.fits is fits
+
+
+def test_compare_says_that_a_model_does_not_describe_an_arm(model, tmp_path, capsys):
+    """What an error depends on says nothing where the model leaves most of the motion."""
+    whole = predicted()
+    motion = fit_of_model(model, [whole]).motion_mm
+    (own, _), (away, _) = (
+        compare(model, [with_points(whole, whole.key_points_mm + shift)])
+        for shift in (np.zeros(3), np.array([0.4 * motion, 0.0, 0.0]))
+    )
+    assert not own.of_another_arm
+    assert "does not describe" not in own.sentence
+    assert away.of_another_arm
+    assert away.of_arm.motion_mm == pytest.approx(motion, rel=1e-3)
+    assert f": the model does not describe this arm's motion of {motion:.2f} mm: check" in (
+        away.sentence
+    )
+    assert "explainable" not in away.sentence
+    assert "depends" not in away.sentence
+    assert not replace(away, setup="a wrong unit").of_another_arm
+    moved = with_points(whole, whole.key_points_mm + np.array([0.4 * motion, 0.0, 0.0]))
+    save_recording(moved, tmp_path / "away.parquet")
+    assert run(["compare", "default", str(tmp_path / "away.parquet")]) == 0
+    assert "next, whether one effect explains most of it: surgisoft diagnose" in (
+        capsys.readouterr().out
+    )
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """`InputError`, the one error type for bad input from outside: files, options, names; warnings."""
 
 import difflib
+import signal
 import traceback
 from collections.abc import Iterable
 from pathlib import Path
@@ -33,6 +34,17 @@ class Interrupted(KeyboardInterrupt):
     def __init__(self, result: Any):
         super().__init__()
         self.result = result
+
+
+class Terminated(SystemExit):
+    """A signal ended the program; the exit code is 128 and its number, as shells have it."""
+
+    def __init__(self, number: int):
+        super().__init__(128 + number)
+        self.name = signal.Signals(number).name
+
+    def __str__(self) -> str:
+        return f"ended by {self.name}"
 
 
 class AssumptionWarning(UserWarning):

@@ -19,9 +19,10 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, Terminated
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -154,9 +155,10 @@ def workers(
         prepared.write_bytes(pickle.dumps(prepare))
     pool = ProcessPoolExecutor(processes, context, initializer=begin_worker, initargs=(prepared,))
     try:
-        with _held_interrupt():
-            pool.submit(os.getpid)  # starts the processes, which inherit what is held
-        yield pool
+        with _raised_at_end():
+            with _held_interrupt():
+                pool.submit(os.getpid)  # starts the processes, which inherit what is held
+            yield pool
     except BaseException:
         for process in list((pool._processes or {}).values()):
             process.terminate()
@@ -186,6 +188,29 @@ def _held_interrupt() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextlib.contextmanager
+def _raised_at_end() -> Iterator[None]:
+    """Raise `Terminated` in the block on SIGTERM, so that what the pool holds is given back.
+
+    By default the process would end at once, and Python would warn of the pool's semaphores. A
+    handler of the program's own stays in force.
+    """
+    main = threading.current_thread() is threading.main_thread()
+    if not main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+
+    def end(number: int, frame: FrameType | None) -> None:
+        signal.signal(number, signal.SIG_IGN)  # the first one ends the program
+        raise Terminated(number)
+
+    signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 @contextlib.contextmanager

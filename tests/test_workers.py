@@ -53,6 +53,22 @@ def test_a_killed_process_leaves_no_worker_behind(tmp_path):
     assert not any(alive(pid) for pid in pids)
 
 
+def test_a_program_that_is_told_to_end_gives_back_its_semaphores(tmp_path):
+    """Python's resource tracker would warn of those that are left."""
+    script = tmp_path / "asks.py"
+    script.write_text(ASKS)
+    asker = subprocess.Popen(
+        [sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    asker.stdout.readline()
+    pids = [int(word) for word in asker.stdout.readline().split()]
+    asker.terminate()
+    _, told = asker.communicate(timeout=20.0)
+    assert "leaked" not in told
+    assert asker.returncode == 128 + signal.SIGTERM
+    assert not any(alive(pid) for pid in pids)
+
+
 UNGUARDED = """
 from functools import partial
 from surgisoft.workers import workers

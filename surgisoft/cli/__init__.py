@@ -225,7 +225,7 @@ def _run(arguments: list[str] | None, written: list[Path]) -> int:
             raise
         return _fail(advice)
     except SystemExit as ended:
-        if isinstance(ended.code, int) and ended.code > 128:  # `surgisoft.rig.safety.Terminated`
+        if isinstance(ended.code, int) and ended.code > 128:  # `surgisoft.errors.Terminated`
             print(f"surgisoft: {ended}", file=sys.stderr)
             return ended.code
         raise

@@ -24,7 +24,7 @@ from surgisoft.agents.policies import POLICIES, Policy, check_policy, open_polic
 from surgisoft.agents.run_folder import RunFolder, run_path
 from surgisoft.agents.session import task_config
 from surgisoft.diagnosis.inputs import seen_in_fit
-from surgisoft.errors import InputError, unknown_name
+from surgisoft.errors import InputError, Terminated, unknown_name
 from surgisoft.files import json_safe
 from surgisoft.live.change import (
     LEAST_BLOCKS,
@@ -55,7 +55,7 @@ from surgisoft.rig.collect import check_fits as check_protocol
 from surgisoft.rig.collect import runs_of
 from surgisoft.rig.interface import Rig, close, is_simulated
 from surgisoft.rig.registry import open_rig, parse_rig
-from surgisoft.rig.safety import SafeRig, Terminated
+from surgisoft.rig.safety import SafeRig
 from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.tasks.base import Episodes, Task, TaskState

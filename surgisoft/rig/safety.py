@@ -34,7 +34,7 @@ from typing import Annotated
 
 import numpy as np
 
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, Terminated
 from surgisoft.rig.interface import Rig, Sample, close, is_simulated, vent, vented
 
 STOP_KEYS = (b" ", b"\x1b")
@@ -49,17 +49,6 @@ LOCK_S = 0.2
 
 class RigStopped(InputError):
     """A run on a real rig was stopped by the safety wrapper, and the rig is vented."""
-
-
-class Terminated(SystemExit):
-    """A signal ended the run; the exit code is 128 and its number, as shells have it."""
-
-    def __init__(self, number: int):
-        super().__init__(128 + number)
-        self.name = signal.Signals(number).name
-
-    def __str__(self) -> str:
-        return f"ended by {self.name}"
 
 
 @dataclass(frozen=True)

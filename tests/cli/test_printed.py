@@ -550,7 +550,7 @@ def test_a_missing_library_is_named_with_its_extra(capsys, monkeypatch):
 
 
 def test_a_command_that_a_signal_ended_has_its_exit_code(capsys, monkeypatch):
-    from surgisoft.rig.safety import Terminated
+    from surgisoft.errors import Terminated
 
     def ended(code):
         def raised(*_, **__):

@@ -13,12 +13,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, Terminated
 from surgisoft.measurement.protocols import Protocol
 from surgisoft.measurement.recordings import ArmInfo
 from surgisoft.rig import RigStopped, SafeRig, Safety, VirtualRig, collect, guarded
 from surgisoft.rig.interface import Sample
-from surgisoft.rig.safety import Terminated
 
 
 class Valves:

@@ -14,14 +14,13 @@ import pytest
 from surgisoft.agents.on_rig import RigConfig
 from surgisoft.agents.session import evaluate
 from surgisoft.cli import run
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, Terminated
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import load_recording
 from surgisoft.rig import RigStopped, VirtualRig, guarded, open_rig
 from surgisoft.rig.drivers.line_protocol import Info, line, words_of
 from surgisoft.rig.drivers.serial_controller import SerialController
 from surgisoft.rig.emulator import emulated
-from surgisoft.rig.safety import Terminated
 from surgisoft.tasks.path_following import FollowConfig
 from surgisoft.tasks.track import TrackConfig
 

@@ -766,7 +766,8 @@ def with_refit(result: Diagnosis, joint: Refit, problem: Problem) -> Diagnosis:
             if claimable(evidence) and worth_of_nothing(quiet) > 0.0:
                 none = Decision("nothing_missing", (), quiet, chances)
             if verdict.effects or verdict.reason == "learned":
-                sentence = sentence_of(none, result.error_mm, [result.error_mm.before])
+                left = without_tried(none, result.statements, tried)
+                sentence = sentence_of(left, result.error_mm, [result.error_mm.before])
                 verdict = Verdict(none.kind, (), sentence, round(quiet, 4), none.reason)
                 ranking = tuple(replace(row, confidence=0.0, in_words="") for row in ranking)
                 command, competing, plan = next_command(none), (), None
@@ -783,6 +784,20 @@ def with_refit(result: Diagnosis, joint: Refit, problem: Problem) -> Diagnosis:
         checks=checks,
         refit=joint,
         next_command=command,
+    )
+
+
+def without_tried(
+    decision: Decision, statements: Iterable[Statement], tried: Collection[str]
+) -> Decision:
+    """The decision with those statements that name none of the effects that the refit tried: the
+    network alone does as well as with one of these."""
+    chances = decision.probabilities
+    effects = {name: chance for name, chance in chances.effects.items() if name not in tried}
+    return replace(
+        decision,
+        probabilities=replace(chances, effects=effects),
+        statements=tuple(each for each in statements if not set(tried).intersection(each.effects)),
     )
 
 

@@ -234,6 +234,28 @@ def test_without_a_winner_nothing_is_missing_only_where_that_is_probable_enough(
     assert found.checks == ("none does better",)
 
 
+def test_without_a_winner_the_most_probable_of_what_is_left_is_told():
+    """Creep was tried: with it the network does no better than alone. A payload was not."""
+    chances = Probabilities(0.44, 0.05, 0.02, {"creep": 0.35, "payload": 0.14}, 0.0, ())
+    statements = (
+        Statement("nothing_missing", (), 0.44, 0.0),
+        Statement("identified", ("creep",), 0.35, 0.0),
+        Statement("ambiguous", ("creep", "payload"), 0.49, 0.1),
+    )
+    residuals = Diagnosis(
+        Verdict("cannot_tell", (), "", reason="learned"), LEVELS, (), statistics=QUIET,
+        probabilities=chances, statements=statements, next_command="surgisoft fit",
+    )  # fmt: skip
+    joint = SimpleNamespace(
+        winner=None, candidates=[SimpleNamespace(effect="creep")], sentence="none does better"
+    )
+    found = with_refit(residuals, joint, None)
+    told = "(most probable: nothing is missing 0.44, payload is missing 0.14); error"
+    assert told in found.verdict.sentence
+    assert found.probabilities == chances
+    assert found.statements == statements
+
+
 def test_what_cannot_be_told_mentions_the_two_most_probable_causes():
     """Also an effect that no statement of its own could be made of."""
     some = (Statement("identified", ("creep",), 0.4, 0.3), Statement("unknown_effect", (), 0.1, 0))

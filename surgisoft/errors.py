@@ -4,6 +4,7 @@ import difflib
 import signal
 import traceback
 from collections.abc import Iterable
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -79,9 +80,29 @@ def raised_by(name: str, error: BaseException, thing: str = "model", file: str =
     )
 
 
+def wrong_type(role: str, given: object, expected: str) -> InputError:
+    """InputError for an argument of another type, as where two arguments are swapped.
+
+    role: what the argument is to the function; expected: its types in words.
+    """
+    return InputError(
+        f"{role} is of type {type(given).__name__}, expected {expected}; check the order of the "
+        "arguments"
+    )
+
+
+def path_of(role: str, given: object, expected: str = "a path") -> Path:
+    """The path that an argument is; raises InputError for another type (`wrong_type`)."""
+    if not isinstance(given, str | PathLike):
+        raise wrong_type(role, given, expected)
+    return Path(given)
+
+
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> InputError:
     """InputError for a name that a registry lacks; the message lists the known names."""
     known = sorted(known)
+    if not isinstance(name, str):
+        return wrong_type(kind, name, f"the name of one, such as {', '.join(known[:3])}")
     near = [each for each in known if len(name) > 2 and each.startswith(name)]
     near = near or difflib.get_close_matches(name[:100], known, 1)
     hint = f"; did you mean '{near[0]}'?" if len(near) == 1 else ""

@@ -11,6 +11,9 @@ import pytest
 import surgisoft
 from surgisoft.cli import run
 from surgisoft.environments import ONE_AGENT
+from surgisoft.errors import InputError
+from surgisoft.surrogate.checkpoint import default_arm
+from tests.diagnosis.test_estimation import bare_arm, measured_on
 
 
 def python(code: str) -> str:
@@ -49,6 +52,40 @@ def test_editors_see_what_the_lazy_import_gives():
     assert set(seen) == set(surgisoft.__all__) - {"__version__"}
     for name, (module, own) in seen.items():
         assert getattr(surgisoft, name) is getattr(sys.modules[module], own)
+
+
+SWAPPED = [
+    ("amend", lambda arm, rec: (arm, ["creep"], [rec]), "one of the effects is of type Recording"),
+    ("amend", lambda arm, rec: (arm, rec, None), "effects is of type NoneType"),
+    ("diagnose", lambda arm, rec: (rec, arm), "recordings is of type ArmModel"),
+    ("compare", lambda arm, rec: ([rec], arm), "recordings is of type ArmModel"),
+    ("improve", lambda arm, rec: (rec, arm), "recordings is of type ArmModel"),
+    ("improve", lambda arm, rec: (arm, rec, ["creep"]), "number of effects is of type list"),
+    ("next_experiment", lambda arm, rec: (rec, arm), "recordings is of type ArmModel"),
+    ("fit", lambda arm, rec: (arm, rec), "recordings is of type ArmModel"),
+    ("save_model", lambda arm, rec: ("arm", arm), "the model to save is of type str"),
+    ("save_recording", lambda arm, rec: ("rec.csv", rec), "recording to save is of type str"),
+    ("load_model", lambda arm, rec: (rec,), "the model is of type Recording"),
+    ("load_recording", lambda arm, rec: (arm,), "the recording is of type ArmModel"),
+    ("load_recordings", lambda arm, rec: ([rec, arm],), "of the recordings is of type ArmModel"),
+    ("collect", lambda arm, rec: (arm,), "the protocol is of type ArmModel"),
+    ("import_recordings", lambda arm, rec: (rec,), "a raw file is of type Recording"),
+    ("make", lambda arm, rec: (arm,), "task is of type ArmModel"),
+    ("parallel_env", lambda arm, rec: (5,), "task is of type int"),
+    ("train", lambda arm, rec: (arm,), "task is of type ArmModel"),
+    ("evaluate", lambda arm, rec: (arm,), "policies is of type ArmModel"),
+    ("run", lambda arm, rec: (arm,), "the policy is of type ArmModel"),
+    ("open_scene", lambda arm, rec: (arm,), "the scene is of type ArmModel"),
+    ("open_replay", lambda arm, rec: (rec,), "the replay is of type Recording"),
+    ("register_effect_file", lambda arm, rec: (arm,), "the file of an effect is of type ArmModel"),
+    ("demo", lambda arm, rec: (5,), "the folder is of type int"),
+]
+
+
+@pytest.mark.parametrize(("name", "given", "told"), SWAPPED)
+def test_arguments_in_another_order_are_bad_input(name, given, told):
+    with pytest.raises(InputError, match=rf"{told}, expected .*; check the order of the argumen"):
+        getattr(surgisoft, name)(*given(default_arm(), measured_on(bare_arm(), rows=50)))
 
 
 def test_an_unknown_name_is_an_attribute_error():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,7 +23,7 @@ from surgisoft.agents.policies import POLICIES, Policy, check_policy, open_polic
 from surgisoft.agents.rollout import BATCH, EpisodeRecorders, rollout
 from surgisoft.agents.run_folder import RunFolder
 from surgisoft.config import to_table
-from surgisoft.errors import InputError, Interrupted, counted
+from surgisoft.errors import InputError, Interrupted, counted, wrong_type
 from surgisoft.files import with_former_keys
 from surgisoft.progress import Progress, silent
 from surgisoft.scene.folder import Scene, open_scene
@@ -337,6 +337,8 @@ def evaluate(
     bench, which is vented first, a batch is one episode), or KeyboardInterrupt where none is.
     """
     given = [policies] if isinstance(policies, str | Path) else policies
+    if not isinstance(given, Iterable):
+        raise wrong_type("policies", given, "the name of a policy, or several names")
     names = tuple(dict.fromkeys(str(name) for name in given))
     request = EvaluationRequest(names, task, **fields).under_rules()
     plain, config = request.resolved(on_warning)

@@ -22,7 +22,7 @@ from surgisoft.diagnosis.pages.amendment import amend_page, track_charts
 from surgisoft.diagnosis.pages.compare import write_report
 from surgisoft.diagnosis.pages.diagnosis import diagnosis_page
 from surgisoft.diagnosis.residuals import residual_table
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, path_of
 from surgisoft.files import note_written, resolved
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.progress import Progress, Stages, silent
@@ -94,7 +94,7 @@ def demo(
     is not empty or cannot be written. This process and the one that records compute on one thread
     each: the tensors of one episode are too small for two.
     """
-    folder = Path(folder)
+    folder = path_of("the folder", folder)
     _claim(folder)
     folder.mkdir(parents=True, exist_ok=True)
     try:

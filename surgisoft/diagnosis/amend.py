@@ -13,6 +13,7 @@ have been fitted by so much of the effects.
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -301,7 +302,7 @@ class Amendment:
 def amend(
     model: Model,
     recordings: Recordings,
-    effects: str | Iterable[str],
+    effects: str | Path | Iterable[str | Path],
     retune_network: bool = True,
     progress: Progress | None = None,
     before: Recordings | None = None,
@@ -337,7 +338,7 @@ def amend(
     """
     begin = time.perf_counter()
     tell = progress or (lambda text: None)
-    names = named_effects([effects] if isinstance(effects, str) else effects)
+    names = named_effects([effects] if isinstance(effects, str | Path) else effects)
     if not names:
         raise InputError(
             "no effect is named to amend the model with, expected at least one, such as creep; "

@@ -39,7 +39,7 @@ from surgisoft.diagnosis.pairs import Change, Paired, before_and_after
 from surgisoft.diagnosis.refit import JointFit, apart_mm, fit_together, in_front
 from surgisoft.diagnosis.residuals import Sealed, model_discrepancy, residual_table
 from surgisoft.diagnosis.setup import find_setup_faults
-from surgisoft.errors import InputError, Interrupted
+from surgisoft.errors import InputError, Interrupted, wrong_type
 from surgisoft.files import with_former_keys
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.progress import Progress as RefitProgress
@@ -272,6 +272,8 @@ def improve(
     are paired, errors are those of the paired difference, and `Improvement.model_error` is that of
     the model itself.
     """
+    if not isinstance(most_effects, int):
+        raise wrong_type("the largest number of effects", most_effects, "an integer")
     if most_effects < 1:
         raise InputError(f"largest number of effects is {most_effects}, expected 1 or more")
     begin = time.perf_counter()
@@ -302,7 +304,7 @@ def improve(
         problem = both.table.training()
         asked = both.training()
     is_paired = both is not None and both.used
-    own = table.training()
+    of_model = table.training()
     made, rounds = [_Made(model, model)], []
     diagnoses: list[Diagnosis] = []
     added: list[str] = []
@@ -374,8 +376,8 @@ def improve(
             alone, both_ = (problem.with_model(each) for each in (fitted.alone, fitted.model))
             doubt = _idle(name, fall_of(alone, both_))
         if not doubt and is_paired and added:
-            of_model = [own.with_model(each) for each in (made[-1].model, fitted.model)]
-            doubt = _harmful(name, fall_of(*of_model))
+            was, now = (of_model.with_model(each) for each in (made[-1].model, fitted.model))
+            doubt = _harmful(name, fall_of(was, now))
         tried = _Tried(name, fitted, fall, doubt)
         if tried.strange and isinstance(fitted, Fitted):
             held = fit_plausible(posed, fitted, [*added, name], name)

@@ -24,7 +24,7 @@ from surgisoft.agents.policies import POLICIES, Policy, check_policy, open_polic
 from surgisoft.agents.run_folder import RunFolder, run_path
 from surgisoft.agents.session import task_config
 from surgisoft.diagnosis.inputs import seen_in_fit
-from surgisoft.errors import InputError, Terminated, unknown_name
+from surgisoft.errors import InputError, Terminated, path_of, unknown_name
 from surgisoft.files import json_safe
 from surgisoft.live.change import (
     LEAST_BLOCKS,
@@ -290,6 +290,7 @@ def run(
         before = (before,)
     if fields.get("output") is not None:
         fields["output"] = Path(fields["output"])
+    policy = path_of("the policy", policy, "its name, or a path")
     request = RunRequest(str(policy), rig, model, before=tuple(before), **fields)
     sinks = Sinks(show, web, None if replay is None else Path(replay), on_address)
     return _Session(request, sinks, on_event, on_warning, progress, stopped).run()

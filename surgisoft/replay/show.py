@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, path_of
 from surgisoft.progress import Progress, silent
 from surgisoft.replay.contents import TIME, contents
 from surgisoft.replay.episode_view import Replay, layout_names, write_replay
@@ -29,7 +29,7 @@ MAGIC = b"RRF2"
 
 def find_replay(path: str | Path) -> Path:
     """The given replay (.rrd) or episode log (.npz), or the newest replay in a run's folder."""
-    path = Path(path)
+    path = path_of("the replay", path)
     if path.is_dir():
         replays = [file for place in PLACES for file in path.glob(place) if file.is_file()]
         if not replays:

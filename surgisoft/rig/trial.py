@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, wrong_type
 from surgisoft.measurement.protocols import Protocol, load_schedule, make_protocol
 from surgisoft.measurement.recordings import Recording
 from surgisoft.progress import Progress, silent
@@ -137,6 +137,8 @@ def _opened(
     mount: dict[str, Any],
 ) -> tuple[Rig, Protocol]:
     """The rig and the protocol of the arguments of `collect`."""
+    if not isinstance(protocol, str | Path | Protocol):
+        raise wrong_type("the protocol", protocol, "its name, a schedule file, or a Protocol")
     if rig is None or isinstance(rig, str):
         bench = rig_of_trial(rig or "virtual", protocol, seed, trial, hidden, **mount)
         if seed is None:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from surgisoft.config import Rule, Where, from_table, read_toml, to_table, write_toml
-from surgisoft.errors import InputError, unknown_name
+from surgisoft.errors import InputError, path_of, unknown_name
 from surgisoft.numbers_in_text import natural_key
 from surgisoft.scene import frames
 from surgisoft.scene.camera import Camera
@@ -33,7 +33,7 @@ def packaged_scene(path: str | Path) -> Path:
 
     A file or folder of that name in the working directory has precedence.
     """
-    path = Path(path)
+    path = path_of("the scene", path)
     if path.exists() or path.is_absolute() or ".." in path.parts:
         return path
     there = SCENES / path

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from surgisoft import __version__
 from surgisoft.config import Where, from_table, value_text
-from surgisoft.errors import InputError, unknown_name
+from surgisoft.errors import InputError, path_of, unknown_name, wrong_type
 from surgisoft.files import new_folder, read_json, resolved
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.callables.arm import arm_by_itself
@@ -122,7 +122,7 @@ def claim_folder(folder: str | Path, force: bool = False) -> Path:
     Raises InputError where the folder is not writable, is in use, or holds something else than a
     model.
     """
-    folder = Path(folder)
+    folder = path_of("the folder of the model", folder)
     above = next(parent for parent in resolved(folder).parents if parent.exists())
     if not above.is_dir() or not os.access(above, os.W_OK):
         raise InputError(f"{folder}: cannot be written, {above} is not a writable folder")
@@ -161,6 +161,8 @@ def save_model(
     of the model). Raises InputError where the folder cannot be written (`claim_folder`, or a full
     disk).
     """
+    if not isinstance(model, ArmModel):
+        raise wrong_type("the model to save", model, "an ArmModel")
     known = model.training_residuals if known is None else known
     folder = claim_folder(folder, force)
     config = {
@@ -211,7 +213,7 @@ def content_hash(model: ArmModel) -> str:
 
 def _place(folder: str | Path) -> Path:
     """Folder of a model; for the name `default`, that of the embedded arm."""
-    folder = Path(folder)
+    folder = path_of("the model", folder, "an ArmModel, or the path of one")
     return DEFAULT_FOLDER if str(folder) == DEFAULT and not folder.exists() else folder
 
 
@@ -236,6 +238,7 @@ def load_model(
     name_callables(model_code)
     if isinstance(folder, ArmModel):
         return folder.to(device)
+    folder = path_of("the model", folder, "an ArmModel, or the path of one")
     if is_callable_name(str(folder)):
         return arm_by_itself(named_callable(str(folder))).to(device)
     folder = _place(folder)

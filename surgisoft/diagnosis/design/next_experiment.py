@@ -69,7 +69,7 @@ from surgisoft.diagnosis.weight import gravity_load
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.measurement.histories import STILL_SHARE
 from surgisoft.measurement.protocols import SIGNALS, Protocol
-from surgisoft.measurement.recordings import Recording, load_recordings
+from surgisoft.measurement.recordings import Recording, given_recordings, load_recordings
 from surgisoft.progress import Progress, Stages, silent
 from surgisoft.surrogate.callables.arm import arm_by_itself
 from surgisoft.surrogate.callables.named import given_callable
@@ -699,7 +699,7 @@ def next_experiment(
     from before a change: what the arm did there as well is no part of the question; paired: as for
     `diagnose`. Raises InputError where the model does not describe BEFORE.
     """
-    given = [recordings] if isinstance(recordings, Recording | str | Path) else list(recordings)
+    given = given_recordings(recordings)
     if not given:
         if is_predictions_file(model) or predictions is not None:
             raise InputError(

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from surgisoft.command_line import typed
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, path_of
 from surgisoft.files import resolved
 from surgisoft.measurement.importing.align import Joined, join
 from surgisoft.measurement.importing.following import following_warnings
@@ -105,7 +105,8 @@ def import_recordings(
     none. name: the files are the runs of one recording of this name; None: each set of files is a
     recording, named after its main file.
     """
-    paths = [Path(path) for path in ([raw] if isinstance(raw, str | Path) else raw)]
+    given = [raw] if isinstance(raw, str | Path) or not isinstance(raw, Iterable) else raw
+    paths = [path_of("a raw file", path) for path in given]
     if map_file is not None:
         return import_files(paths, load_map(str(map_file)), name)
     if paths and all(path.suffix == LOG_SUFFIX for path in paths):

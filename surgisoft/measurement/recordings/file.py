@@ -4,6 +4,7 @@ import csv
 import itertools
 import warnings
 from collections.abc import Callable, Iterable
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet as pq
 
-from surgisoft.errors import InputError, exists_already
+from surgisoft.errors import InputError, exists_already, path_of, wrong_type
 from surgisoft.files import new_file, new_folder, resolved
 from surgisoft.measurement.recordings.columns import Layout, parse_header
 from surgisoft.measurement.recordings.log import SUFFIX as LOG_SUFFIX
@@ -40,7 +41,7 @@ def load_recording(path: str | Path, on_warning: Warn | None = None) -> Recordin
     base frame, NaN where one was not seen. Raises InputError, with file and row, for a file that is
     not such a table.
     """
-    return _read(Path(path), on_warning or _warn)
+    return _read(path_of("the recording", path), on_warning or _warn)
 
 
 def load_recordings(
@@ -52,7 +53,7 @@ def load_recordings(
     Recordings that are open already stay as they are. Raises InputError where a path does not
     exist, a folder holds no recording, or a file is not one (`load_recording`).
     """
-    given = [paths] if isinstance(paths, str | Path | Recording) else list(paths)
+    given = given_recordings(paths)
     if any(isinstance(item, Recording) for item in given):
         read = ([i] if isinstance(i, Recording) else load_recordings(i, on_warning) for i in given)
         return [recording for part in read for recording in part]
@@ -62,6 +63,22 @@ def load_recordings(
     for text in copies_of_others(found):
         (on_warning or _warn)(text)
     return found
+
+
+def given_recordings(
+    paths: Iterable[str | Path | Recording] | str | Path | Recording,
+) -> list[str | Path | Recording]:
+    """One recording or several as a list, not yet read; raises InputError for other types."""
+    expected = "a Recording, a path, or several of them"
+    if isinstance(paths, str | Path | Recording):
+        return [paths]
+    if not isinstance(paths, Iterable):
+        raise wrong_type("recordings", paths, expected)
+    given = list(paths)
+    for each in given:
+        if not isinstance(each, str | PathLike | Recording):
+            raise wrong_type("one of the recordings", each, expected)
+    return given
 
 
 def recording_files(paths: Iterable[str | Path] | str | Path) -> list[Path]:
@@ -304,7 +321,9 @@ def save_recording(recording: Recording, path: str | Path, force: bool = False) 
     Both are complete under temporary names before either is renamed. Existing files are not
     replaced unless `force` is set.
     """
-    path = Path(path)
+    if not isinstance(recording, Recording):
+        raise wrong_type("the recording to save", recording, "a Recording")
+    path = path_of("the file of the recording", path)
     check_writable(path, force)
     try:
         with new_file(path) as table, new_file(sidecar_of(path)) as sidecar:

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-from surgisoft.errors import InputError, unknown_name
+from surgisoft.errors import InputError, unknown_name, wrong_type
 from surgisoft.files import resolved
 from surgisoft.surrogate.effects import user_defined
 from surgisoft.surrogate.effects.base import (
@@ -126,11 +126,21 @@ def registered_files() -> list[str]:
     return [file.path for file in user_defined.FILES.values()]
 
 
-def named_effects(given: Iterable[str]) -> list[str]:
-    """The names of effects, each given as to `named_effect`; files have to have different names."""
+def named_effects(given: Iterable[str | Path]) -> list[str]:
+    """The names of effects, each given as to `named_effect`; files have to have different names.
+
+    Raises InputError for other types.
+    """
+    expected = "the name of an effect, its file (my_effect.py), or several of them"
+    if not isinstance(given, Iterable):
+        raise wrong_type("effects", given, expected)
     given = list(given)
-    _of_different_names(each for each in given if _is_file(each))
-    return [named_effect(each) for each in given]
+    for each in given:
+        if not isinstance(each, str | Path):
+            raise wrong_type("one of the effects", each, expected)
+    names = [str(each) for each in given]
+    _of_different_names(each for each in names if _is_file(each))
+    return [named_effect(each) for each in names]
 
 
 def _is_file(given: str) -> bool:

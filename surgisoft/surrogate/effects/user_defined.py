@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, path_of
 from surgisoft.surrogate.effects.base import STAGES, Effect
 
 GROUP = "surgisoft.effects"
@@ -48,7 +48,7 @@ def register_effect_file(path: str | Path, taken: Container[str] = ()) -> str:
     taken: names of the package's effects. Raises InputError where the file is missing, does not
     run, does not hold exactly one complete `Effect`, or has a name that is in use.
     """
-    path = Path(path)
+    path = path_of("the file of an effect", path)
     name = path.stem
     if not path.is_file():
         raise InputError(f"{path}: no such file; name a .py file that defines one Effect")

@@ -7,10 +7,11 @@ A key point that shifts against its neighbours from one moment on is a marker th
 Neighbouring key points lie on one body, so whatever physics changes, the residual of one follows
 from those of the others and from the actuation. What does not is an error of that key point alone.
 A step in it at one moment is sought on held-out blocks (with a known moment: Chow 1960; the moment
-is searched, see `change_points`).
+is searched, see `change_points`). A marker may also slide, so a gradual change is tried in its
+place.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -27,6 +28,11 @@ LEAST_ABOVE = 0.02
 ALONE = 1.0 / 3.0
 """Largest step of another key point at that moment, over that of the shifted one: where the whole
 body steps, its tip is shifted a little further than noisy neighbours say."""
+GRADUAL = 3.0
+"""Studentised log gain over blocks of a slide over the best step from which the key point is said
+to slide. Both are searched; the slide, with two moments in place of one, has the freer form."""
+GRADUAL_GAIN = 0.1
+"""Least mean log gain of a slide over the best step: a tenth of the error."""
 LEAST_ROWS = 100
 """Fewest rows with all key points; with fewer there is no test."""
 
@@ -69,6 +75,18 @@ def body_jumps(table: ResidualTable, before_mm: float | None = None) -> BodyJump
 
 
 @dataclass(frozen=True)
+class Slide:
+    """A key point that moves evenly against the others from one moment to another."""
+
+    from_s: float
+    """Begin, s, all recordings in turn."""
+    until_s: float
+    """End, s, all recordings in turn."""
+    shift_mm: float
+    """How far it is shifted at the end, mm."""
+
+
+@dataclass(frozen=True)
 class KeyPointShift:
     """The most probable shift of one key point against the others."""
 
@@ -86,6 +104,8 @@ class KeyPointShift:
     log_gain: float
     """Mean over blocks of log(held-out error of the key point before / with the shift), the noise
     added to both."""
+    slide: "Slide | None" = None
+    """The gradual motion of this key point, where that explains clearly more than a step."""
 
     @property
     def clarity(self) -> float:
@@ -109,6 +129,7 @@ def key_point_shift(problem: Problem) -> KeyPointShift | None:
     actuation = _quadratic(problem.pressure[rows])
     ones = np.ones((len(rows), 1), np.float32)
     best: KeyPointShift | None = None
+    found: tuple = ()
     for place, point in enumerate(points):
         others = np.delete(residual, place, axis=1).reshape(len(rows), -1)
         columns = _scaled(
@@ -139,7 +160,39 @@ def key_point_shift(problem: Problem) -> KeyPointShift | None:
             others=_others(actuation, residual, place, first),
             log_gain=gain,
         )
-    return best
+        found = (folds, columns, after + floor, block, floor)
+    return best if best is None else replace(best, slide=_slide(problem, rows, *found))
+
+
+def _slide(
+    problem: Problem,
+    rows: np.ndarray,
+    folds: FoldsOfRidge,
+    columns: np.ndarray,
+    stepped: np.ndarray,
+    block: np.ndarray,
+    floor: np.ndarray,
+) -> Slide | None:
+    """The slide of a key point that explains clearly more on held-out rows than its best step.
+
+    Begin and end are searched (`change_points.slides`); the log gains of the blocks say whether it
+    explains more (Vuong 1989). folds, columns: of the residual of this key point; stepped: (B,)
+    squared error of each block with the step and the noise `floor` (B,), mm^2.
+    """
+    part = (np.arange(len(rows)) / max(len(rows) - 1, 1))[:, None]
+    tried = change_points.slides()
+    states = [np.clip((part - a) / (b - a), 0.0, 1.0).astype(np.float32) for a, b in tried]
+    left = folds.with_states(RIDGE, states)
+    best = int(np.argmin([np.square(each, dtype=float).sum() for each in left]))
+    slid = block_sums(np.square(left[best], dtype=float).sum(1), block) + floor
+    gain = np.log(stepped / slid)
+    error = float(gain.std(ddof=1)) / np.sqrt(len(gain))
+    if gain.mean() < GRADUAL_GAIN or gain.mean() < GRADUAL * error:
+        return None
+    ends = [rows[round(each * (len(rows) - 1))] for each in tried[best]]
+    from_s, until_s = problem.table.along_s[problem.index.numpy()[ends]]
+    shift = _amplitude(columns, folds.target, states[best])
+    return Slide(float(from_s), float(until_s), float(np.linalg.norm(shift)))
 
 
 def _best_step(
@@ -178,7 +231,12 @@ def _others(actuation: np.ndarray, residual: np.ndarray, place: int, first: int)
 
 def _step(columns: np.ndarray, target: np.ndarray, first: int) -> np.ndarray:
     """(C,) step of a target (S, C), mm, from a row on, beside columns (S, F)."""
-    step = (np.arange(len(target)) >= first).astype(float)[:, None]
+    return _amplitude(columns, target, (np.arange(len(target)) >= first)[:, None])
+
+
+def _amplitude(columns: np.ndarray, target: np.ndarray, state: np.ndarray) -> np.ndarray:
+    """(C,) amplitude of a state (S, 1) in a target (S, C), mm, beside columns (S, F)."""
+    step = state.astype(float)
     wide = columns.astype(float)
     gram = wide.T @ wide + RIDGE * np.eye(wide.shape[1])
     free = step - wide @ np.linalg.solve(gram, wide.T @ step)

@@ -11,8 +11,19 @@ TRIED = 24
 """Moments that are tried first. The nearest one is off by a fiftieth of the time at most."""
 FINER = 8
 """Steps between two of these, in which the best of them is refined."""
+SLIDES = 10
+"""Steps in which begin and end of a gradual change are tried."""
+LEAST_SLIDE = 0.2
+"""Shortest gradual change that is tried, as a share of the rows; a shorter one is a step."""
 MARGIN = 0.04
 """Share of the rows before the first moment, and behind the last one."""
+
+
+def slides() -> list[tuple[float, float]]:
+    """Begin and end of the gradual changes that are tried, all that last for `LEAST_SLIDE` or
+    longer."""
+    ends = np.linspace(0.0, 1.0, SLIDES + 1).tolist()
+    return [(a, b) for a in ends for b in ends if b - a >= LEAST_SLIDE - 1e-9]
 
 
 def coarse() -> np.ndarray:

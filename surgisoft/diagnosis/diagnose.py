@@ -712,7 +712,10 @@ def with_setup(wrong: SetupResult) -> Diagnosis:
 
 
 def with_axis(result: Diagnosis, problem: Problem) -> Diagnosis:
-    """The diagnosis with the axis that the error depends on most, where one is clear."""
+    """The diagnosis with the axis that the error depends on most, where one is clear and no key
+    point has shifted."""
+    if result.statistics is not None and slipped(result.statistics):
+        return result  # what moves with a marker is no cause of its shift
     axis = next((each for each in shares(problem) if each.clear), None)
     if axis is None:
         return result
@@ -1018,7 +1021,16 @@ def slipped(evidence: Evidence, recordings: int = 1) -> list[str]:
     """
     if evidence.shift < CLEAR_SHIFT:
         return []
-    when = f"{evidence.shift_at_s:.0f} s on" + ", all recordings in turn" * (recordings > 1)
+    turn = ", all recordings in turn" * (recordings > 1)
+    if evidence.slide_until_s:
+        stretch = f"{evidence.slide_from_s:.0f} s to {evidence.slide_until_s:.0f} s"
+        return [
+            f"key point k{evidence.shift_key_point} slides gradually, by about "
+            f"{evidence.slide_mm:.2g} mm against the others from about {stretch}{turn} (or in "
+            "several steps): its marker has probably come loose, so fix it and record again, or "
+            "leave this key point out"
+        ]
+    when = f"{evidence.shift_at_s:.0f} s on{turn}"
     return [
         f"key point k{evidence.shift_key_point} is shifted by {evidence.shift_mm:.3g} mm against "
         f"the others from {when}: its marker has probably slipped, so use the rows before that "
@@ -1030,7 +1042,10 @@ def before_the_slip(evidence: Evidence, table: ResidualTable) -> str:
     """The command to run after a marker has slipped, with {model}, {data} and {before}.
 
     Of one recording the rows before the slip are written; which of several it is in is not said.
+    Nothing where the marker slides, because no rows are without an error then.
     """
+    if evidence.slide_until_s:
+        return ""
     until = int(evidence.shift_at_s - SLIP_MARGIN * table.along_s[-1])
     if len(table.names) > 1 or until <= 0:
         return WITHOUT_SLIP

@@ -204,12 +204,20 @@ class Evidence:
     """Number of that key point, from 0 at the base; -1 where the shift was not sought."""
     shift_at_s: float = 0.0
     """Time from which on it is shifted, s, all recordings in turn."""
+    slide_from_s: float = 0.0
+    """Begin of the gradual motion of that key point, s, all recordings in turn; 0 where a step
+    explains as much (`abrupt.Slide`), and in stored evidence that does not have it."""
+    slide_until_s: float = 0.0
+    """End of it, s; 0 where a step explains as much."""
+    slide_mm: float = 0.0
+    """How far the key point is shifted at the end of it, mm."""
 
     def to_json(self) -> dict:
-        """Plain values; no frequency of a line and no moment of a jump where there is none, as in
-        evidence of before."""
+        """Plain values; no frequency of a line, no moment of a jump and no slide where there is
+        none, as in evidence of before."""
         plain = asdict(self)
-        for name in ("line_hz", "jump_largest_s"):
+        slide = ("slide_from_s", "slide_until_s", "slide_mm")
+        for name in ("line_hz", "jump_largest_s", *slide):
             if not plain[name]:
                 del plain[name]
         return plain
@@ -282,6 +290,7 @@ def abrupt_changes(problem: Problem) -> dict[str, Any]:
     """The numbers of `Evidence` on jumps of the body and on a key point that shifts."""
     table = problem.table
     body, shift = table.jumps or body_jumps(table), key_point_shift(problem)
+    slide = shift.slide if shift else None
     sizes, along_s = body.jumps.sizes_mm, table.along_s[table.timed]
     return {
         "jumps": body.share,
@@ -292,6 +301,9 @@ def abrupt_changes(problem: Problem) -> dict[str, Any]:
         "shift_mm": shift.shift_mm if shift else 0.0,
         "shift_key_point": shift.key_point if shift else -1,
         "shift_at_s": shift.at_s if shift else 0.0,
+        "slide_from_s": slide.from_s if slide else 0.0,
+        "slide_until_s": slide.until_s if slide else 0.0,
+        "slide_mm": slide.shift_mm if slide else 0.0,
     }
 
 

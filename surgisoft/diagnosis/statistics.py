@@ -279,9 +279,13 @@ class FoldsOfRidge:
         """For each number of rows before a break (S, C) what is left with the state (S, k) behind
         the break as further columns, mm."""
         behind = [np.arange(len(state)) >= first for first in rows_before]
-        wide = np.concatenate([state * each[:, None] for each in behind], axis=1)
-        answer = [np.empty_like(self.target) for _ in behind]
-        size = state.shape[1]
+        return self.with_states(ridge, [state * each[:, None] for each in behind])
+
+    def with_states(self, ridge: float, states: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """For each state (S, k) what is left (S, C) with it as further columns, mm."""
+        wide = np.concatenate(states, axis=1)
+        answer = [np.empty_like(self.target) for _ in states]
+        size = states[0].shape[1]
         crossed, grams, moments = (
             (other.T @ wide).astype(float) for other in (self.columns, wide, self.target)
         )

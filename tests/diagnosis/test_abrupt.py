@@ -1,5 +1,6 @@
 """A key point that shifts against the others, and jumps beside those of the arm before."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -59,6 +60,46 @@ def test_a_marker_that_slips_is_found_where_and_when_it_does():
     assert found.log_gain > 0.5
     assert found.others < 0.2
     assert found.clarity == pytest.approx(np.sqrt(found.share) * found.log_gain)
+
+
+def sliding(point, by, from_row, until_row):
+    """(ROWS, 3, 3) mm: one key point that moves evenly against the others between two rows."""
+    change = np.zeros((ROWS, 3, 3))
+    part = (np.arange(ROWS) - from_row) / (until_row - from_row)
+    change[:, point] = np.clip(part, 0.0, 1.0)[:, None] * np.asarray(by)
+    return change
+
+
+@pytest.mark.parametrize(("from_row", "until_row"), [(0, 800), (160, 1120)])
+def test_a_marker_that_slides_is_told_from_one_that_slips(from_row, until_row):
+    """Half a millimetre in half of the recording and longer, and not at once."""
+    change = bending() + sliding(1, [0.6, 0.0, 0.8], from_row, until_row)
+    found = key_point_shift(posed(change))
+    assert found.key_point == 1
+    step = 0.1 * ROWS * PERIOD_S
+    assert found.slide.from_s == pytest.approx(from_row * PERIOD_S, abs=step)
+    assert found.slide.until_s == pytest.approx(until_row * PERIOD_S, abs=step)
+    assert found.slide.shift_mm == pytest.approx(1.0, rel=0.1)
+    for row in (300, 900):
+        assert key_point_shift(posed(bending() + shifted(1, row, [0.3, 0.0, 0.4]))).slide is None
+
+
+def test_after_a_slide_no_rows_are_recommended():
+    slide = moved_by(bending() + sliding(1, [0.6, 0.0, 0.8], 160, 1120))
+    found = diagnose(still_model(), [slide], setup_tests=False, refit="never")
+    assert found.verdict.kind == "unknown_effect"
+    told = re.search(
+        "key point k1 slides gradually, by about ([0-9.]+) mm against the others from about "
+        "([0-9]+) s to ([0-9]+) s ",
+        found.verdict.sentence,
+    )
+    assert float(told[1]) == pytest.approx(1.0, rel=0.15)
+    # In steps of a tenth of the three quarters that are looked at.
+    assert [float(told[2]), float(told[3])] == pytest.approx([16.0, 112.0], abs=12.0)
+    assert "fix it and record again, or leave this key point out" in found.verdict.sentence
+    assert "use the rows before" not in found.verdict.sentence
+    assert "depends most on" not in found.verdict.sentence
+    assert found.next_command == ""
 
 
 def test_the_share_of_a_slip_is_one_of_what_is_above_the_noise():

@@ -593,6 +593,9 @@ def test_an_asset_of_other_features_is_refused(tmp_path):
 def test_evidence_survives_json():
     full = replace(GOOD, proposals=(ALONE, replace(PAIR, instead=("drift",), instead_left=(0.1,))))
     assert Evidence.from_json(json.loads(json.dumps(full.to_json()))) == full
+    assert not any(name.startswith("slide") for name in full.to_json()), "as stored evidence"
+    slides = replace(full, slide_until_s=9.0, slide_mm=2.0)
+    assert Evidence.from_json(slides.to_json()) == slides
 
 
 @given(

@@ -1,6 +1,7 @@
 """A part of a recording: the rows between two times."""
 
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +37,7 @@ def part_of(
     if alarm is not None:
         kept = recording.t_s[inside]
         alarm = alarm if kept[0] <= alarm.raised_s <= kept[-1] else None
-    rows = {
+    rows: dict[str, Any] = {
         each.name: value[inside]
         for each in fields(recording)
         if isinstance(value := getattr(recording, each.name), np.ndarray) and each.name != "gravity"

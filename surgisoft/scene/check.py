@@ -20,6 +20,7 @@ from surgisoft.scene.lesion import (
     circle_on,
     distance_from_ring_mm,
     nearest_on_surface,
+    path_crossing_mm,
     path_off_mm,
     path_slack_mm,
 )
@@ -248,12 +249,21 @@ def _lesion_finding(scene: Scene) -> Finding:
         except InputError:
             value, lies = f"its ring of {lesion.diameter_mm:g} mm extends over an edge", False
             if lesion.path_mm:
-                away = path_off_mm(scene.organ.world_mesh, lesion)
-                value = f"its path_mm leaves the surface by {away:.3g} mm"
+                value = _path_fault(scene)
     wanted = f"{ON_SURFACE_MM:g} mm, whole ring"
     if lesion.path_mm:
         wanted = f"{ON_SURFACE_MM:g} mm, path {path_slack_mm(lesion):g} mm"
     return Finding("lesion on the surface", value, wanted, lies)
+
+
+def _path_fault(scene: Scene) -> str:
+    """What is wrong with the lesion's own path."""
+    mesh, lesion = scene.organ.world_mesh, scene.spec.lesion
+    away = path_off_mm(mesh, lesion)
+    place = path_crossing_mm(mesh, lesion)
+    if away > path_slack_mm(lesion) or place is None:
+        return f"its path_mm leaves the surface by {away:.3g} mm"
+    return f"its path_mm crosses itself near {tuple(place.round(1).tolist())} mm"
 
 
 def _neighbour_findings(scene: Scene) -> tuple[Finding, ...]:

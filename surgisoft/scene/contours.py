@@ -17,6 +17,7 @@ import numpy as np
 
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
+from surgisoft.scene.crossings import SAMPLED_MM, crossing_mm
 from surgisoft.scene.lesion import ON_SURFACE_MM, circle_on, dropped, nearest_on_surface
 from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.spec import ContourSpec
@@ -122,12 +123,18 @@ class Plane:
     """(3, 3): the columns are the plane's two axes and its normal, world frame."""
 
     @classmethod
-    def of(cls, mesh: Mesh, outline_mm: np.ndarray) -> Plane:
+    def of(cls, mesh: Mesh, outline_mm: np.ndarray, what: str = "the outline") -> Plane:
         """The plane of a closed outline (N, 3) mm on the mesh.
 
         The normal is that of the polygon (Newell's sum of cross products), on the outer side of the
-        surface under it.
+        surface under it. An InputError names `what` where it crosses itself.
         """
+        if (place := outline_crossing_mm(mesh, outline_mm)) is not None:
+            raise InputError(
+                f"{what} crosses itself near {_text(place)} mm, so it has no inside; expected a "
+                "loop without a crossing: divide it into several, or, where it is only followed, "
+                "make it open (closed = false)"
+            )
         middle = outline_mm.mean(axis=0)
         away = outline_mm - middle
         newell = np.cross(away, np.roll(away, -1, axis=0)).sum(axis=0)
@@ -153,6 +160,13 @@ class Plane:
         return points + heights[:, None] * self.axes[:, 2]
 
 
+def outline_crossing_mm(mesh: Mesh, outline_mm: np.ndarray) -> np.ndarray | None:
+    """(3,) mm: where a closed outline (N, 3) mm on the mesh crosses itself; see `crossing_mm`."""
+    fine = resampled(np.vstack((outline_mm, outline_mm[:1])), SAMPLED_MM)[:-1]
+    points, faces = nearest_on_surface(mesh, fine)
+    return crossing_mm(points, mesh.face_normals[faces])
+
+
 def grown(mesh: Mesh, outline_mm: np.ndarray, margin_mm: float, what: str = "path") -> np.ndarray:
     """(M, 3) mm: the closed outline (N, 3) mm on the mesh, grown outwards by a margin.
 
@@ -161,7 +175,7 @@ def grown(mesh: Mesh, outline_mm: np.ndarray, margin_mm: float, what: str = "pat
     """
     from contourpy import contour_generator
 
-    plane = Plane.of(mesh, outline_mm)
+    plane = Plane.of(mesh, outline_mm, what)
     polygon = plane.flat(outline_mm)
     edge = margin_mm + 4.0 * GRID_MM
     low, high = polygon.min(axis=0) - edge, polygon.max(axis=0) + edge
@@ -189,9 +203,14 @@ def signed_distance_mm(points: np.ndarray, polygon: np.ndarray) -> np.ndarray:
     return np.where(_inside(points, polygon), -1.0, 1.0) * np.sqrt(best)
 
 
-def inside_outline(mesh: Mesh, outline_mm: np.ndarray, points_mm: np.ndarray) -> np.ndarray:
-    """(P,) bool: points (P, 3) mm inside a closed outline (N, 3) mm, seen along its normal."""
-    plane = Plane.of(mesh, outline_mm)
+def inside_outline(
+    mesh: Mesh, outline_mm: np.ndarray, points_mm: np.ndarray, what: str = "the outline"
+) -> np.ndarray:
+    """(P,) bool: points (P, 3) mm inside a closed outline (N, 3) mm, seen along its normal.
+
+    An InputError names `what` where the outline crosses itself.
+    """
+    plane = Plane.of(mesh, outline_mm, what)
     return _inside(plane.flat(points_mm), plane.flat(outline_mm))
 
 

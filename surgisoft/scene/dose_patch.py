@@ -269,7 +269,8 @@ def _path_samples(
         facing = frames.dot(mesh.face_normals[faces], below) > LEAST_FACING
         within = np.zeros(len(points), dtype=bool)
         if path.closed:
-            within = inside_outline(mesh, path.points_mm, points) & facing
+            name = f"contour '{path.name}'"
+            within = inside_outline(mesh, path.points_mm, points, name) & facing
         inside |= within
         nearer = (away < best) & facing
         best, owner = np.where(nearer, away, best), np.where(nearer, number, owner)

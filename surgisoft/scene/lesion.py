@@ -7,6 +7,7 @@ an existing one for training.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -15,6 +16,7 @@ import numpy as np
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
 from surgisoft.scene.bvh import build_tree
+from surgisoft.scene.crossings import SAMPLED_MM, crossing_mm
 from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.rays import EmbreeSurface
 from surgisoft.scene.spec import LesionSpec
@@ -185,6 +187,15 @@ def path_off_mm(mesh: Mesh, lesion: LesionSpec, count: int = RING_POINTS) -> flo
     return float(np.linalg.norm(points - path, axis=1).max())
 
 
+def path_crossing_mm(mesh: Mesh, lesion: LesionSpec) -> np.ndarray | None:
+    """(3,) mm: where the user's own path crosses itself on the mesh; see `crossing_mm`."""
+    corners = np.array([*lesion.path_mm, lesion.path_mm[0]])
+    length = float(np.linalg.norm(np.diff(corners, axis=0), axis=1).sum())
+    count = max(3, math.ceil(length / SAMPLED_MM))
+    points, faces = nearest_on_surface(mesh, _resampled(lesion, count))
+    return crossing_mm(points, mesh.face_normals[faces])
+
+
 def _resampled(lesion: LesionSpec, count: int) -> np.ndarray:
     """(count, 3) points, evenly spaced along the user's own closed path (mm)."""
     corners = np.array([*lesion.path_mm, lesion.path_mm[0]])
@@ -202,6 +213,11 @@ def _path_ring(mesh, lesion, centre, face, count) -> Ring:
         raise InputError(
             f"lesion.path_mm leaves the surface of '{lesion.body}' by {off.max():.3g} mm; "
             "expected points on the surface, close enough together to follow it"
+        )
+    if (place := path_crossing_mm(mesh, lesion)) is not None:
+        raise InputError(
+            f"lesion.path_mm crosses itself near {tuple(place.round(3).tolist())} mm, so it has no "
+            "inside; expected a loop without a crossing: leave out all loops but one"
         )
     normal = patch_normal(mesh, centre, face, 0.5 * lesion.diameter_mm)
     return Ring(centre, normal, points, mesh.face_normals[faces], faces)

@@ -301,6 +301,22 @@ def test_a_path_off_the_organ_tells_how_far(made, tmp_path, capsys):
     assert "extends over" not in said
 
 
+def test_a_path_that_crosses_itself_is_a_verdict(made, tmp_path, capsys):
+    """A bow tie of 12 mm around the lesion's centre, on the organ's surface."""
+    scene = open_scene(made[1])
+    lesion, ring = scene.spec.lesion, scene.ring
+    points = [tuple(map(float, ring.points_mm[i])) for i in (0, 36, 18, 54)]
+    folder = scene_with(made, tmp_path, lesion=dataclasses.replace(lesion, path_mm=tuple(points)))
+    assert run(["scene", "check", str(folder)]) == 1
+    said = capsys.readouterr().out
+    found = re.search(
+        r"BAD lesion on the surface +its path_mm crosses itself near \((.*)\) mm", said
+    )
+    assert found, said
+    place = np.array([float(x) for x in found[1].split(",")])
+    assert np.linalg.norm(place - ring.centre_mm) < 3.0, "where the diagonals meet"
+
+
 def test_an_arm_model_that_is_not_there_names_file_and_field(made, tmp_path, capsys):
     mounts = list(open_scene(made[1]).spec.mounts)
     mounts[1] = dataclasses.replace(mounts[1], arm="nosuch")

@@ -195,3 +195,23 @@ def test_a_contour_off_the_organ_is_named(plane):
         contour_path(plane, spec(centre_mm=[37.0, 0.0, 5.0]), 0.2)
     with pytest.raises(InputError, match="open; an area needs a closed"):
         area_patch(plane, (laid(plane, disc(5.0), False, 0.1),), 0.3, 1.0)
+
+
+def test_an_outline_that_crosses_itself_has_no_inside(plane):
+    """An eight about (3, -2): every use of its inside is refused, following it as open is not."""
+    eight = np.stack((3 + 6 * np.sin(LOOP), 5 * np.sin(LOOP) * np.cos(LOOP) - 2, 5 + 0 * LOOP), 1)
+    place = r"crosses itself near \(3\.0, -2\.0, 5\.0\) mm"
+    closed, points = laid(plane, eight, True, 0.2, "e"), eight[::9].tolist()
+    refused = (
+        lambda: contour_path(plane, spec(points_mm=points, margin_mm=1.0), 0.2),
+        lambda: path_patch(plane, (closed,), 0.3),
+        lambda: area_patch(plane, (closed,), 0.3, 1.0),
+        lambda: raster(plane, closed.points_mm, 1.0, 0.0, 0.2),
+    )
+    for use in refused:
+        with pytest.raises(InputError, match=place):
+            use()
+    with pytest.raises(InputError, match="contour 'e' crosses itself"):
+        path_patch(plane, (closed,), 0.3)
+    followed = contour_path(plane, spec(points_mm=[*points, points[0]], closed=False), 0.2)
+    assert not (path_patch(plane, (followed,), 0.3).zone == LESION).any()

@@ -1,6 +1,7 @@
 """Rings on surfaces against closed forms, nearest points against brute force."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -266,3 +267,13 @@ def test_a_ring_too_large_for_the_organ_tells_one_that_fits(diameter):
     fits = float(re.search(r"a ring of (\S+) mm fits", str(caught.value))[1])
     assert 20.0 <= fits <= 29.1
     assert good_sites([whole(small)], fits)
+
+
+def test_an_own_path_that_crosses_itself_is_refused_with_the_place():
+    """A bow tie on a flat side: its diagonals meet at (2, 3)."""
+    tie = tuple((x, y, 40.0) for x, y in ((-4.0, -3.0), (8.0, 9.0), (8.0, -3.0), (-4.0, 9.0)))
+    lesion = LesionSpec("organ", (2.0, 3.0, 40.0), path_mm=tie)
+    with pytest.raises(InputError, match=r"path_mm crosses itself near \(2\.0, 3\.0, 40\.0\) mm"):
+        lesion_ring(BOX, lesion)
+    plain = replace(lesion, path_mm=(tie[0], tie[2], tie[1], tie[3]))
+    assert np.ptp(lesion_ring(BOX, plain, 96).points_mm, axis=0).tolist() == [12.0, 12.0, 0.0]

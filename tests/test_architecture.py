@@ -105,7 +105,7 @@ FLOORS = {
     ),
     "scene": (
         ("frames",),
-        ("mesh", "capsules", "moving"),
+        ("mesh", "capsules", "crossings", "moving"),
         ("meshio", "bvh", "plate"),
         ("warp_kernels",),
         ("rays",),

@@ -1,4 +1,4 @@
-"""Check a whole scene with FCL: meshes, lesion, all arms at rest and at work, the view."""
+"""Check a whole scene with FCL: meshes, lesion, contours, arms at rest and at work, the view."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -14,11 +14,14 @@ from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.camera import view
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import CollisionChecker
+from surgisoft.scene.contours import SurfacePath, contour_path, outline_crossing_mm
 from surgisoft.scene.folder import Scene
 from surgisoft.scene.lesion import (
     ON_SURFACE_MM,
+    RING_POINTS,
+    Ring,
     circle_on,
-    distance_from_ring_mm,
+    distance_from_points_mm,
     nearest_on_surface,
     path_crossing_mm,
     path_off_mm,
@@ -37,9 +40,12 @@ from surgisoft.scene.mounted_arm import (
     touch_lesion,
 )
 from surgisoft.scene.reach import ArmReach
+from surgisoft.scene.spec import CameraSpec
 
 REASONS = ("can be cut", "out of reach", "too steep", "beam blocked", "no clearance", "arm jumps")
 """Meaning of a ring point's code; a point gets the first that applies after the first entry."""
+CONTOUR_STEP_MM = 0.5
+"""Spacing of a contour's points, of which RING_POINTS are checked (mm)."""
 PATCH_SHARES = np.linspace(0.1, 1.6, 16)
 """Diameters of the reachability map's circles, as shares of the lesion's diameter."""
 
@@ -149,23 +155,77 @@ def check_scene(
 
     `reaches` holds the arms' reach tables by name.
     """
-    findings: tuple[Finding, ...] = (*_mesh_findings(scene), _lesion_finding(scene))
-    if not findings[-1].good:
+    lesion = _lesion_finding(scene)
+    paths, laid = _contour_paths(scene)
+    findings: tuple[Finding, ...] = (*_mesh_findings(scene), lesion, *laid)
+    if not lesion.good:
         return SceneCheck(findings, None)
-    findings = (*findings, *_neighbour_findings(scene))
+    findings = (*findings, *_neighbour_findings(scene, "ring", scene.ring.points_mm))
     checker, arms = CollisionChecker(scene.bodies), mounted_arms(scene, reaches)
-    work = _work(scene, checker, arms, report)
+    work = _work(scene, scene.ring, True, checker, arms, report)
     moments = len(work.clearance_mm)
     report(moments + 1, moments + 2, "paths from rest")
     ways = _way_finding(scene, checker, arms, work)
-    return SceneCheck((*findings, *_work_findings(scene, work), ways), work)
+    findings = (*findings, *_work_findings(scene, work), ways)
+    for path in paths:
+        findings = (*findings, *_contour_findings(scene, path, checker, arms))
+    return SceneCheck(findings, work)
+
+
+def _contour_paths(scene: Scene) -> tuple[list[SurfacePath], list[Finding]]:
+    """The scene's contours that lie on the organ, and what was found of each contour's place."""
+    mesh, paths, rows = scene.organ.world_mesh, [], []
+    for contour in scene.spec.contours:
+        what, wanted = f"contour '{contour.name}'", f"{ON_SURFACE_MM:g} mm"
+        try:
+            path = contour_path(mesh, contour, CONTOUR_STEP_MM)
+        except InputError as error:
+            fault = str(error).removeprefix(f"{what}: ").partition("; expected")[0]
+            rows.append(Finding(f"{what} on the surface", fault, wanted, False))
+            continue
+        place = outline_crossing_mm(mesh, path.points_mm) if path.closed else None
+        if place is not None:
+            value = f"crosses itself near {tuple(place.round(1).tolist())} mm"
+            rows.append(Finding(f"{what} on the surface", value, "one inside", False))
+            continue
+        value = f"{path.length_mm:.1f} mm long"
+        rows.append(Finding(f"{what} on the surface", value, wanted, True))
+        paths.append(path)
+    return paths, rows
+
+
+def _contour_findings(
+    scene: Scene, path: SurfacePath, checker: CollisionChecker, arms: dict[str, MountedArm]
+) -> list[Finding]:
+    """A contour's distance from what must not be touched, and the lasers' reach along it.
+
+    The endoscopes look at the contour's middle. How much of the contour they see is not checked: a
+    task that cuts contours moves them along.
+    """
+    what = f"contour '{path.name}'"
+    nearby = _neighbour_findings(scene, what, path.points_mm)
+    count = min(RING_POINTS, len(path.points_mm))
+    chosen = np.linspace(0, len(path.points_mm) - 1, count, endpoint=not path.closed).astype(int)
+    middle, face = nearest_on_surface(scene.organ.world_mesh, path.middle_mm[None])
+    points, normals = path.points_mm[chosen], path.normals[chosen]
+    ring = Ring(middle[0], path.normal, points, normals, np.repeat(face, count))
+    work = _work(scene, ring, path.closed, checker, arms, silent)
+    return [*nearby, *_reach_findings(work, what)]
 
 
 def _work(
-    scene: Scene, checker: CollisionChecker, arms: dict[str, MountedArm], report: Progress
+    scene: Scene,
+    ring: Ring,
+    closed: bool,
+    checker: CollisionChecker,
+    arms: dict[str, MountedArm],
+    report: Progress,
 ) -> Work:
-    """Move the lasers once around the ring while the endoscopes look at it."""
-    spec, ring = scene.spec, scene.ring
+    """Move the lasers once around a ring while the endoscopes look at it.
+
+    closed: whether the ring's last point is followed by the first.
+    """
+    spec = scene.spec
     limits = spec.limits
     cuts = {name: solve_ring(arms[name], ring, spec.laser) for name in spec.arms_with("laser")}
     looks = {
@@ -201,12 +261,15 @@ def _work(
     for k, (name, cut) in enumerate(cuts.items()):
         near = np.empty(count)
         near[points[:, k]] = clearance
-        step = np.maximum(cut.step_mm, np.roll(cut.step_mm, 1))
+        onward = cut.step_mm if closed else np.append(cut.step_mm[:-1], 0.0)
+        step = np.maximum(onward, np.roll(onward, 1))
         close = near < np.maximum(limits.clearance_mm, 0.5 * step)
         jumps = step > 0.5 * arms[name].reach.radius_mm
         tests = (~cut.in_reach, cut.steep, ~landed[name], close, jumps)
         reasons[name] = np.select(tests, range(1, len(REASONS)), 0)
-    views = {name: _view(checker, name, look, scenes, scene) for name, look in looks.items()}
+    views = {
+        name: _view(checker, name, look, scenes, ring, spec.camera) for name, look in looks.items()
+    }
     return Work(reasons, cuts, looks, touches, clearance, views)
 
 
@@ -266,19 +329,22 @@ def _path_fault(scene: Scene) -> str:
     return f"its path_mm crosses itself near {tuple(place.round(1).tolist())} mm"
 
 
-def _neighbour_findings(scene: Scene) -> tuple[Finding, ...]:
-    """Distance of the cut from each body that must not be touched, such as a vessel below it."""
+def _neighbour_findings(scene: Scene, what: str, points_mm: np.ndarray) -> tuple[Finding, ...]:
+    """Distance of a cut along points (M, 3) mm from each body that must not be touched, such as a
+    vessel below it."""
     least = scene.spec.limits.clearance_mm
     rows = []
     for name, mesh in scene.keep_out.items():
-        away = distance_from_ring_mm(mesh, scene.ring)
-        rows.append(Finding(f"ring to '{name}'", f"{away:.1f} mm", f"{least:g} mm", away >= least))
+        away = distance_from_points_mm(mesh, points_mm)
+        rows.append(
+            Finding(f"{what} to '{name}'", f"{away:.1f} mm", f"{least:g} mm", away >= least)
+        )
     return tuple(rows)
 
 
-def _work_findings(scene: Scene, work: Work) -> tuple[Finding, ...]:
-    limits, (low, high) = scene.spec.limits, scene.spec.camera.range_mm
-    least, rows = float(work.clearance_mm.min()), []
+def _reach_findings(work: Work, what: str) -> list[Finding]:
+    """Which share of a path each laser can cut, and what keeps it from the rest."""
+    rows = []
     for name, reason in work.reasons.items():
         lacking = [
             f"{100 * np.mean(reason == code):.0f} % {REASONS[code]}"
@@ -286,7 +352,13 @@ def _work_findings(scene: Scene, work: Work) -> tuple[Finding, ...]:
         ]
         whose = "the laser's reach" if len(work.reasons) == 1 else f"reach of {name}"
         covered = ", ".join((f"{100 * np.mean(reason == 0):.0f} %", *lacking))
-        rows.append(Finding(f"ring in {whose}", covered, "100 %", not lacking))
+        rows.append(Finding(f"{what} in {whose}", covered, "100 %", not lacking))
+    return rows
+
+
+def _work_findings(scene: Scene, work: Work) -> tuple[Finding, ...]:
+    limits, (low, high) = scene.spec.limits, scene.spec.camera.range_mm
+    least, rows = float(work.clearance_mm.min()), _reach_findings(work, "ring")
     rows.append(
         Finding(
             "clearance at work",
@@ -338,13 +410,14 @@ def _view(
     name: str,
     look: EndoscopePose,
     scenes: list[dict[str, ArmShape]],
-    scene: Scene,
+    ring: Ring,
+    camera: CameraSpec,
 ) -> np.ndarray:
     """Fraction of ring points in view of an endoscope at every VIEW_EVERYth moment.
 
     The endoscope stands still: what the bodies hide from it is found once.
     """
-    given = scene.spec.camera.camera(), look.pose, scene.ring.points_mm, scene.ring.normals
+    given = camera.camera(), look.pose, ring.points_mm, ring.normals
     among_bodies, arms_alone = view(checker, *given).visible, CollisionChecker([])
     fractions = []
     for shapes in scenes[::VIEW_EVERY]:

@@ -442,10 +442,15 @@ TRIES = 20
 """Places tried for each lesion before the variation is given up."""
 
 
+def distance_from_points_mm(mesh: Mesh, points_mm: np.ndarray) -> float:
+    """Least distance of a mesh's surface from points (M, 3) mm, both in the world frame (mm)."""
+    nearest, _ = nearest_on_surface(mesh, points_mm)
+    return float(np.linalg.norm(nearest - points_mm, axis=1).min())
+
+
 def distance_from_ring_mm(mesh: Mesh, ring: Ring) -> float:
     """Distance of a mesh's surface from the points of a ring, both in the world frame (mm)."""
-    nearest, _ = nearest_on_surface(mesh, ring.points_mm)
-    return float(np.linalg.norm(nearest - ring.points_mm, axis=1).min())
+    return distance_from_points_mm(mesh, ring.points_mm)
 
 
 def lesions_like(

@@ -34,9 +34,10 @@ from surgisoft.scene.check import (
 )
 from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.folder import open_scene
+from surgisoft.scene.lesion import nearest_on_surface
 from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.meshio import write_ply
-from surgisoft.scene.spec import FILE, LesionSpec, MountSpec, save_spec
+from surgisoft.scene.spec import FILE, ContourSpec, LesionSpec, MountSpec, save_spec
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.model import ArmModel
@@ -315,6 +316,54 @@ def test_a_path_that_crosses_itself_is_a_verdict(made, tmp_path, capsys):
     assert found, said
     place = np.array([float(x) for x in found[1].split(",")])
     assert np.linalg.norm(place - ring.centre_mm) < 3.0, "where the diagonals meet"
+
+
+def test_contours_are_checked_as_the_ring_is(made, tmp_path, capsys):
+    """On the ring's place, on the underside, 7 mm off the organ's surface, and an eight."""
+    scene = open_scene(made[1])
+    ring, organ = scene.ring, scene.organ.world_mesh
+    lowest = organ.vertices_mm[organ.vertices_mm[:, 2].argmin()]
+    line = [lowest, nearest_on_surface(organ, lowest[None] + [3.0, 0.0, 0.0])[0][0]]
+    outwards = ring.points_mm[:9] + 7.0 * ring.normal
+    off = np.linalg.norm(nearest_on_surface(organ, outwards)[0] - outwards, axis=1).max()
+
+    def points(rows):
+        return tuple(tuple(map(float, row)) for row in rows)
+
+    contours = (
+        ContourSpec("top", points(ring.points_mm[::6])),
+        ContourSpec("under", points(line), closed=False),
+        ContourSpec("high", points(outwards)),
+        ContourSpec("eight", points(ring.points_mm[[0, 36, 18, 54]]), closed=True),
+        ContourSpec("open_eight", points(ring.points_mm[[0, 36, 18, 54, 0]]), closed=False),
+    )
+    laid = [contour for contour in contours if contour.name not in ("eight", "open_eight")]
+    assert run(["scene", "check", str(scene_with(made, tmp_path, contours=tuple(laid)))]) == 1
+    said = capsys.readouterr().out
+    assert "The scene is not ready: contour 'high' on the surface: point" in said
+    assert re.search(
+        rf"BAD contour 'high' on the surface +point . of 9, .* lies {off:.3g} mm", said
+    )
+    assert re.search(r"ok +contour 'top' in the laser's reach +100 %", said)
+    assert re.search(r"BAD contour 'under' in the laser's reach +0 %, 100 % ", said)
+    assert "contour 'high' in" not in said
+    # the rod is a cylinder of 8 mm radius along z through (90, 0) mm
+    away = {
+        "top": np.hypot(ring.points_mm[:, 0] - 90.0, ring.points_mm[:, 1]).min() - 8.0,
+        "under": min(np.hypot(row[0] - 90.0, row[1]) for row in line) - 8.0,
+    }
+    for name, expected in away.items():
+        told = re.search(rf"contour '{name}' to 'rod' +(\S+) mm", said)
+        assert float(told[1]) == pytest.approx(expected, abs=0.3)
+
+    crossed = check_scene(
+        dataclasses.replace(scene, spec=dataclasses.replace(scene.spec, contours=contours[3:])),
+        reaches_of(scene),
+    )
+    assert not finding(crossed, "contour 'eight' on the surface").good
+    assert "crosses itself" in finding(crossed, "contour 'eight' on the surface").value
+    assert finding(crossed, "contour 'open_eight' on the surface").good
+    assert finding(crossed, "contour 'open_eight' in the laser's reach").value == "100 %"
 
 
 def test_an_arm_model_that_is_not_there_names_file_and_field(made, tmp_path, capsys):

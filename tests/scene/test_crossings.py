@@ -23,6 +23,12 @@ def curve(x, y, count=720):
     return np.stack((x(t), y(t)), axis=1)
 
 
+def polar(radius):
+    """Corners of the curve radius(t), mm."""
+    return curve(lambda t: radius(t) * np.cos(t), lambda t: radius(t) * np.sin(t))
+
+
+SLIT = [(-9, -9), (9, -9), (9, 9), (0.05, 9), (0.05, 0), (-0.05, 0), (-0.05, 9), (-9, 9)]
 CROSSED = {
     "eight": (curve(lambda t: 10 * np.sin(t), lambda t: 8 * np.sin(t) * np.cos(t)), [0.0, 0.0]),
     "eight with a corner in the crossing": (
@@ -30,17 +36,14 @@ CROSSED = {
         [0.0, 0.0],
     ),
     "bow tie": (np.array([[0, 0], [6, 6], [6, 0], [0, 2]], float), [1.5, 1.5]),
-    "inner loop": (
-        curve(lambda t: (2 + 4 * np.cos(t)) * np.cos(t), lambda t: (2 + 4 * np.cos(t)) * np.sin(t)),
-        [0.0, 0.0],
-    ),
+    "inner loop": (polar(lambda t: 2 + 4 * np.cos(t)), [0.0, 0.0]),
 }
 SIMPLE = {
-    "circle": curve(lambda t: 10 * np.cos(t), lambda t: 10 * np.sin(t)),
+    "circle": polar(lambda t: 10.0),
     "first corner repeated": np.array([[0, 0], [6, 0], [6, 6], [0, 0]], float),
-    "star": curve(lambda t: (8 + 4 * np.cos(5 * t)) * np.cos(t), lambda t: (8 + 4 * np.cos(5 * t)) * np.sin(t)),
-    "slit of 0.1 mm": np.array([[-9, -9], [9, -9], [9, 9], [0.05, 9], [0.05, 0], [-0.05, 0], [-0.05, 9], [-9, 9]], float),
-}  # fmt: skip
+    "star": polar(lambda t: 8 + 4 * np.cos(5 * t)),
+    "slit of 0.1 mm": np.array(SLIT, float),
+}
 
 
 @pytest.mark.parametrize("name", CROSSED)

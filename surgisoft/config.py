@@ -160,6 +160,12 @@ def parse_toml(text: str, path: Path) -> dict:
     except RecursionError:
         raise InputError(f"{path}: not valid TOML: nested too deeply") from None
     except ValueError as error:  # TOMLDecodeError, and integers of too many digits
+        if found := re.search(r"immutable namespace \((.*)\) \(at line (\d+)", str(error)):
+            names = re.findall(r"'([^']+)'", found[1])
+            raise InputError(
+                f"{path}:{found[2]}: not valid TOML: the table '{'.'.join(names)}' after a line "
+                f"'{names[-1]} = ...'; expected one of the two: delete that line"
+            ) from None
         raise InputError(f"{path}: not valid TOML: {_short(str(error), 200)}") from None
 
 
@@ -203,6 +209,25 @@ def to_table(config: typing.Any) -> typing.Any:
     if isinstance(config, tuple | list):
         return [to_table(item) for item in config]
     return str(config) if isinstance(config, Path) else config
+
+
+def without_empty_tables(kind: type, table: dict) -> dict:
+    """The table of a dataclass `kind` without its lists of tables that are empty by default.
+
+    A line `contours = []` would forbid to append `[[contours]]` to the file that is written.
+    """
+    kept = {}
+    for field in dataclasses.fields(kind):
+        if field.name not in table:
+            continue
+        value, base = table[field.name], _split(_hints(kind)[field.name])[0]
+        parts = typing.get_args(base)
+        if dataclasses.is_dataclass(base) and isinstance(value, dict):
+            value = without_empty_tables(typing.cast(type, base), value)
+        tables = typing.get_origin(base) is tuple and dataclasses.is_dataclass(_split(parts[0])[0])
+        if not (tables and not value and field.default == ()):
+            kept[field.name] = value
+    return kept
 
 
 def merged(base: typing.Any, changes: typing.Any) -> typing.Any:

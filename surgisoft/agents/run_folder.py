@@ -26,11 +26,11 @@ import torch
 import surgisoft
 from surgisoft.agents.presets import Plan, Preset
 from surgisoft.command_line import typed
-from surgisoft.config import POSITIVE, Where, at_least, from_table, to_table, write_toml
+from surgisoft.config import POSITIVE, Where, at_least, from_table, to_table
 from surgisoft.errors import InputError
 from surgisoft.files import new_folder, read_json, write_atomically
 from surgisoft.scene.folder import open_scene
-from surgisoft.scene.spec import FILE, arm_names
+from surgisoft.scene.spec import FILE, arm_names, save_spec
 from surgisoft.surrogate.checkpoint import save_model
 from surgisoft.tasks.base import Task
 from surgisoft.tasks.registry import config_from, make_task, package_of, task_names, with_fields
@@ -168,7 +168,7 @@ def _copied_scene(plan: Plan, fresh: Path) -> dict | None:
         replace(mount, arm=f"../arms/{name}")
         for name, mount in zip(arm_names(scene.spec.mounts), scene.spec.mounts, strict=True)
     )
-    write_toml(fresh / "scene" / FILE, to_table(replace(scene.spec, mounts=mounts)))
+    save_spec(replace(scene.spec, mounts=mounts), fresh / "scene" / FILE)
     return {"from": str(source), "hash": scene.content_hash}
 
 

@@ -19,6 +19,7 @@ from surgisoft.config import (
     path_beside,
     read_toml,
     to_table,
+    without_empty_tables,
     write_toml,
 )
 from surgisoft.errors import InputError
@@ -314,7 +315,8 @@ def save_experiment(spec: Experiment, path: Path) -> None:
         for name in ("policy", "arm"):
             if case[name] not in ("", "default", SCRIPTED, NOMINAL):
                 case[name] = _from_folder(case[name], folder)
-    write_toml(path, table)
+    table["task"] = without_empty_tables(type(spec.task), table["task"])
+    write_toml(path, without_empty_tables(Experiment, table))
 
 
 def _from_folder(path: str, folder: Path) -> str:

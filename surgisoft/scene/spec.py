@@ -14,7 +14,15 @@ from typing import Annotated
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from surgisoft.config import Rule, Where, from_table, read_toml, to_table, write_toml
+from surgisoft.config import (
+    Rule,
+    Where,
+    from_table,
+    read_toml,
+    to_table,
+    without_empty_tables,
+    write_toml,
+)
 from surgisoft.errors import InputError, path_of, unknown_name
 from surgisoft.numbers_in_text import natural_key
 from surgisoft.scene import frames
@@ -369,7 +377,7 @@ def save_spec(spec: SceneSpec, path: str | Path) -> None:
     path = Path(path)
     table, where = to_table(spec), Where(path)
     _check_whole(from_table(SceneSpec, table, where), where)
-    write_toml(path, table)
+    write_toml(path, without_empty_tables(SceneSpec, table))
 
 
 def _check_whole(spec: SceneSpec, where: Where) -> None:

@@ -162,6 +162,26 @@ def test_a_bad_field_is_one_line(field, there, put, says, tmp_path):
         assert f": {field}: " in message
 
 
+def test_contours_can_be_appended_to_a_written_file(tmp_path):
+    file = tmp_path / FILE
+    save_spec(plain(), file)
+    assert "contours" not in file.read_text()
+    with file.open("a") as text:
+        text.write('\n[[contours]]\nname = "c"\ncentre_mm = [1.0, 2.0, 3.0]\n')
+    (contour,) = load_spec(file).contours
+    assert (contour.name, contour.centre_mm) == ("c", (1.0, 2.0, 3.0))
+    save_spec(load_spec(file), file)
+    assert load_spec(file).contours == (contour,)
+
+
+def test_a_table_after_an_empty_list_of_that_name_says_which_line_to_delete(tmp_path):
+    """Files of earlier versions have the line."""
+    file = tmp_path / FILE
+    file.write_text('name = "s"\ncontours = []\n\n[[contours]]\nname = "c"\n')
+    with pytest.raises(InputError, match=r"toml:4: .*'contours' after a line 'contours = \.\.\.'"):
+        load_spec(file)
+
+
 def test_the_line_number_is_the_fields_own(tmp_path):
     save_spec(plain(), tmp_path / FILE)
     lines = (tmp_path / FILE).read_text().splitlines()

@@ -29,6 +29,7 @@ from surgisoft.progress import Progress, silent
 from surgisoft.scene.folder import Scene, open_scene
 from surgisoft.tasks.base import Episodes, Task
 from surgisoft.tasks.episodes.log import EpisodeLog
+from surgisoft.tasks.laser_dose import weak_laser
 from surgisoft.tasks.path_following import beyond_reach
 from surgisoft.tasks.registry import (
     config_of,
@@ -345,6 +346,8 @@ def evaluate(
     _warn_of_reach(plain, on_warning)
     if beyond := beam_beyond_limits_of(config):
         on_warning(beyond)
+    if request.rules is None and (weak := weak_laser(plain)):
+        on_warning(weak)
     place = plain
     if request.rig is not None:
         from surgisoft.agents.on_rig import on_rig

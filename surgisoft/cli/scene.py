@@ -7,6 +7,7 @@ import typer
 
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder, show_written
+from surgisoft.cli.inputs import warn
 from surgisoft.cli.options import EffectFiles, Force, Port, SaveReplay, Screenshot, Web
 from surgisoft.cli.progress import progress
 from surgisoft.command_line import typed
@@ -171,7 +172,7 @@ def check(
     """Check a scene with FCL: meshes, lesion, reach of the ring, contacts, view."""
     from surgisoft.scene.check import check_scene, reach_patches
     from surgisoft.scene.folder import open_scene
-    from surgisoft.tasks.world.reach import reaches_of
+    from surgisoft.tasks.world.reach import reaches_of, ring_dose_lacking
 
     scene = open_scene(folder)
     if picture is not None:
@@ -183,6 +184,8 @@ def check(
     with progress("scene check") as report:
         verdict = check_scene(scene, reaches, report)
     _print_check(verdict)
+    if verdict.work is not None and (weak := ring_dose_lacking(scene)):
+        warn(weak)
     if picture is not None and verdict.work is None:
         print(f"{picture}: not drawn, because the ring does not lie on the organ")
     elif picture is not None:

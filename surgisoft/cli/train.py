@@ -75,7 +75,7 @@ def _assigned(changes: list[str], task: str | None, given: dict) -> str | None:
 
 def _show_plan(plan) -> None:
     """Print what differs from the task's defaults and from the preset's hyper-parameters, and warn
-    of a scene whose beams pass its own limits."""
+    of a scene whose beams pass its own limits or are too weak."""
     from surgisoft.agents.presets import preset_for
     from surgisoft.agents.session import beam_beyond_limits_of
     from surgisoft.config import differences
@@ -90,6 +90,12 @@ def _show_plan(plan) -> None:
         print("changed from the default:", *lines, sep="\n  ", flush=True)
     if beyond := beam_beyond_limits_of(plan.task_config):
         warn(beyond)
+    if getattr(plan.task_config, "scene", None) is not None:
+        from surgisoft.tasks.laser_dose import weak_laser
+        from surgisoft.tasks.registry import make_task
+
+        if weak := weak_laser(make_task(plan.task, plan.task_config)):
+            warn(weak)
 
 
 @app.command()

@@ -18,7 +18,7 @@ from surgisoft.experiments.controllers import PhaseControllers
 from surgisoft.experiments.page import experiment_page, markdown, shown_episodes
 from surgisoft.experiments.phases import PhasedTask
 from surgisoft.experiments.pictures import film, write_pictures
-from surgisoft.experiments.plan import scene_of, settings
+from surgisoft.experiments.plan import Setting, build_task, scene_of, settings
 from surgisoft.experiments.results import Results, drop_logs, sum_up, write_tables
 from surgisoft.experiments.run import DROPPED, open_results, run_experiment
 from surgisoft.experiments.spec import SCRIPTED, Experiment, load_experiment
@@ -30,6 +30,7 @@ from surgisoft.rig.registry import SIMULATED, check_rig, parse_rig
 from surgisoft.scene.spec import FILE as SCENE_FILE
 from surgisoft.scene.spec import MOST_LETTERS, PHANTOM, packaged_scene
 from surgisoft.tasks.base import Task
+from surgisoft.tasks.laser_dose import weak_laser
 from surgisoft.tasks.world.reach import beam_beyond_limits
 
 PACKAGED = PHANTOM / "experiments"
@@ -210,7 +211,7 @@ def finish_experiment(
     cluster: address of a Dask scheduler whose workers run the episodes. on_warning: gets each
     warning of the episodes once.
     """
-    for line in beams_beyond_limits(spec):
+    for line in (*beams_beyond_limits(spec), *weak_lasers(spec)):
         on_warning(line)
     rows = run_experiment(spec, folder, processes, progress, cluster, on_warning)
     results = sum_up(spec, folder, rows)
@@ -235,6 +236,28 @@ def beams_beyond_limits(spec: Experiment) -> list[str]:
     for setting in {setting.lesion: setting for setting in settings(spec)}.values():
         if beyond := beam_beyond_limits(scene_of(spec, setting)):
             found.append(f"lesion '{setting.lesion.name}': {beyond}" if setting.lesion else beyond)
+    return found
+
+
+def weak_lasers(spec: Experiment) -> list[str]:
+    """See `weak_laser`: one line for each different task whose beam, in the phases that have one,
+    is too weak to treat what a success needs."""
+    beam_s = sum(phase.timeout_s for phase in spec.phases if phase.beam)
+    if not spec.in_scene or not beam_s:
+        return []
+    different: dict[Any, Setting] = {}
+    for setting in settings(spec):
+        values = tuple((name, value) for name, value in setting.values if name[:5] == "task.")
+        different.setdefault((setting.lesion, values), replace(setting, values=values))
+    found = []
+    for setting in different.values():
+        simulated = replace(setting, case=replace(setting.case, plant="simulation"))
+        try:
+            base = build_task(spec, simulated, on_warning=None).base
+        except InputError:  # the run names the setting
+            continue
+        if weak := weak_laser(base, min(beam_s, spec.limits.time_s)):
+            found.append(f"setting '{setting.label}': {weak}" if len(different) > 1 else weak)
     return found
 
 

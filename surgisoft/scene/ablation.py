@@ -76,6 +76,14 @@ class Tissue:
         return self.threshold_j_per_mm2 * math.exp(self.absorption_per_mm * depth_mm)
 
 
+def line_dose_j_per_mm2(power_w: float, waist_mm: float, speed_mm_s: float) -> float:
+    """Largest dose (J/mm^2) of a beam that moves in a straight line across a flat surface once.
+
+    The Gaussian of `sweep_fluence`, integrated along the line: sqrt(2 / pi) P / (w v).
+    """
+    return math.sqrt(2.0 / math.pi) * power_w / (waist_mm * speed_mm_s)
+
+
 REACH_WAISTS = 2.3
 """The beam is cut off at this many 1/e^2 radii; 3e-5 of its power lies beyond."""
 COARSEST_WAISTS = 0.9
@@ -177,6 +185,7 @@ class AblationMap:
         self.patch, self.waist_mm, self.tissue = patch, float(waist_mm), tissue or Tissue()
         self.threshold = self.tissue.threshold_j_per_mm2
         self.cut_dose = self.tissue.dose_for_depth(depth_mm)
+        self.exact_lesion = exact_lesion
         self._counted = np.full(3, self.threshold)
         if exact_lesion:
             self._counted[LESION] = self.cut_dose
@@ -198,6 +207,17 @@ class AblationMap:
         zone, areas = self.patch.zone, self.patch.areas_mm2
         lesion, ring, healthy = (float(areas[zone == k].sum()) for k in (LESION, RING, HEALTHY))
         return lesion, ring, healthy
+
+    def treated(self, state: AblationState) -> tuple[torch.Tensor, torch.Tensor]:
+        """(B,) J/mm^2: largest dose where it counts; (B,) 0..1: share that has the dose that cuts.
+
+        Of the lesion's area with `exact_lesion`, else of the ring's length.
+        """
+        if not self.exact_lesion:
+            return state.peak.amax(1), self.report(state).completion
+        inside = torch.as_tensor(self.patch.zone == LESION, device=self.device)
+        share = state.zone_mm2[:, LESION] / self.zone_areas_mm2[LESION]
+        return state.dose[:, inside].amax(1), share
 
     def start(
         self,

@@ -132,6 +132,7 @@ class AreaAblation(RouteTask):
 
     name = "area_ablation"
     signals = (*RouteTask.signals, TREATED_SHARE)
+    dose_fields = "pitch_mm, speed_mm_s"
     leap_steps = 2.5
     """At the end of a row the next one begins nearer than this many steps of the reference, or the
     beam would burn on the way."""

@@ -43,7 +43,7 @@ from surgisoft.tasks.trajectories.closed_path import RingCut, point_on_closed
 from surgisoft.tasks.trajectories.routes import RouteProgress
 from surgisoft.tasks.world.arm import ArmPart, as_known, measured_exactly
 from surgisoft.tasks.world.pytree import TensorDataclass
-from surgisoft.tasks.world.random_streams import Stream
+from surgisoft.tasks.world.random_streams import Stream, streams
 from surgisoft.tasks.world.scene import (
     PHANTOM,
     AblationState,
@@ -570,6 +570,9 @@ class RingTask(OneLaserTask[Cut]):
     The config has `cut_s`, the time for once around with the beam on, s.
     """
 
+    dose_fields = "cut_s"
+    """Fields of the config that decide about the dose on the path."""
+
     def __init__(self, config: Any, device: str | torch.device = "cpu", **others: Any):
         """The arguments are those of `LaserTask`."""
         super().__init__(config, device, **others)
@@ -579,6 +582,20 @@ class RingTask(OneLaserTask[Cut]):
                 f"{self.name}: cut_s is {config.cut_s:g} s, expected at least a step, "
                 f"{self.dt_s:g} s"
             )
+
+    @property
+    def pass_steps(self) -> int:
+        """Steps of once around with the beam on (a count)."""
+        return self.round
+
+    def reference(self, steps: int) -> tuple[Tensor, Tensor, Tensor]:
+        """The reference of the first lesion with the beam on for `steps` steps, its organ at rest:
+        points (steps + 1, 3) mm, unit normals of the surface, whether the beam is on (bool)."""
+        share = torch.arange(steps + 1, device=self.scene.device) / self.round
+        points = point_on_closed(self.scene.paths_mm[:1], torch.zeros_like(share).long(), share)
+        count = self.scene.paths_mm.shape[1]
+        near = (share * count).round().long().remainder(count)
+        return points, self.scene.path_normals[0, near], torch.ones_like(near, dtype=torch.bool)
 
     def target_mm(self, state: TaskState[Cut], ahead: int = 0) -> Tensor:
         """(B, 3) mm: the reference point on the ring `ahead` steps further on."""
@@ -614,8 +631,26 @@ class RouteTask(OneLaserTask[RouteProgress]):
     """
 
     signals: tuple[Signal, ...] = (VIEW_FRACTION, RELEASED)
+    dose_fields = "speed_mm_s"
+    """Fields of the config that decide about the dose on the paths."""
     leap_steps: float
     """Two targets farther apart than this many steps of the reference lie on different paths."""
+
+    @property
+    def pass_steps(self) -> int:
+        """Steps of a route over all paths (a count)."""
+        return self.goal(streams(0, 1, device=self.scene.device))[1].steps
+
+    def reference(self, steps: int) -> tuple[Tensor, Tensor, Tensor]:
+        """A reference with the beam on for `steps` steps, again from its start after its end:
+        points (steps + 1, 3) mm, unit normals of the surface, whether the beam is on in the step
+        that leads there (bool)."""
+        _, goal = self.goal(streams(0, 1, device=self.scene.device))
+        place = torch.arange(steps + 1, device=self.scene.device).remainder(goal.steps)
+        points = self.scene.path_mm[goal.route[0, place]]
+        normals = self.scene.path_normals[0, goal.route[0, place]]
+        step = (points - points.roll(1, 0)).norm(dim=1)
+        return points, normals, step <= self.leap_steps * self.config.speed_mm_s * self.dt_s
 
     def target_mm(self, state: TaskState[RouteProgress], ahead: int = 0) -> Tensor:
         """(B, 3) mm: the reference point on the paths `ahead` steps further on."""

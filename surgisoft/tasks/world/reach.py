@@ -1,4 +1,7 @@
-"""Reach tables of a scene's arms: centrelines of the arm models as plain geometry."""
+"""Reach tables of a scene's arms: centrelines of the arm models as plain geometry.
+
+With them, whether beams around a scene's ring keep its limits, and are strong enough to cut it.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -10,6 +13,8 @@ import torch
 
 from surgisoft.config import Where, read_toml
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.scene.ablation import Tissue, line_dose_j_per_mm2
+from surgisoft.scene.contours import arc_length_mm
 from surgisoft.scene.folder import Scene
 from surgisoft.scene.mounted_arm import MountedArm, solve_ring
 from surgisoft.scene.reach import ArmReach
@@ -18,6 +23,7 @@ from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.callables.named import is_callable_name
 from surgisoft.surrogate.checkpoint import default_arm, load_model
 from surgisoft.surrogate.reach import grid_axes, model_table
+from surgisoft.tasks.world.scene import SceneEngineConfig
 
 SAME_LENGTH_MM = 1.0
 """A mount's length may differ by this from its model's (mm)."""
@@ -178,3 +184,25 @@ def _default_table() -> tuple:
     """`_table` of the model that ships with the package, which never changes."""
     model = default_arm()
     return model_table(model), model.spec
+
+
+def ring_dose_lacking(scene: Scene) -> str:
+    """In which way a scene's lasers are too weak to cut its ring once around in the whole of its
+    time, in words; empty where they are not, and without a laser."""
+    spec, count = scene.spec, len(scene.spec.arms_with("laser"))
+    if not count:
+        return ""
+    length_mm = arc_length_mm(np.vstack((scene.ring.points_mm, scene.ring.points_mm[:1])))
+    laser, depth_mm = spec.laser, SceneEngineConfig().depth_mm
+    needed = Tissue(laser.absorption_per_mm).dose_for_depth(depth_mm)
+    speed_mm_s = length_mm / spec.limits.time_s
+    largest = line_dose_j_per_mm2(count * laser.power_w, 0.5 * laser.spot_mm, speed_mm_s)
+    if largest >= needed:
+        return ""
+    beams = "the beam" if count == 1 else f"the {count} beams"
+    return (
+        f"{beams} of {laser.power_w:g} W, once around the ring in the {spec.limits.time_s:g} s of "
+        f"the scene, gives at most {largest:.3g} J/mm2, less than the {needed:.3g} J/mm2 that cut "
+        f"{depth_mm:g} mm deep: more power_w or a smaller spot_mm in [laser], or a longer time_s "
+        "in [limits]"
+    )

@@ -21,6 +21,7 @@ from surgisoft.scene.lesion import (
     OrganSurface,
     Site,
     directed_site,
+    dropped,
     good_sites,
     nearest_on_surface,
     patch_normal,
@@ -41,7 +42,12 @@ from surgisoft.scene.mounted_arm import RingSolution
 from surgisoft.scene.mounts import Arrangement, find_mounts
 from surgisoft.scene.reach import ArmReach
 from surgisoft.scene.repair import repair
-from surgisoft.scene.segmentation import Label, is_segmentation, read_segmentation
+from surgisoft.scene.segmentation import (
+    Label,
+    SegmentedLesion,
+    is_segmentation,
+    read_segmentation,
+)
 from surgisoft.scene.spec import (
     FILE,
     BodySpec,
@@ -76,6 +82,10 @@ DIAMETERS_MM = (0.5, 500.0)
 """Least and largest diameter of a ring that is accepted (mm): a slip of the unit is outside."""
 WIDEST_MM = 100.0
 """Largest margin and clearance that are accepted (mm)."""
+CENTRING_STEPS = 8
+"""Most turns in which a ring is centred over a segmented lesion (a count)."""
+CENTRED_MM = 0.02
+"""A ring is centred over a lesion to this distance (mm)."""
 COARSE_RING = 36
 """Number of ring points during the search for mounts."""
 CROSSING = "the surface intersects itself, only its outermost part counts; faces inside the solid"
@@ -181,8 +191,8 @@ class Prepared:
     """(3, 3) from the first file's own frame and unit to the world frame, mm, before the shift."""
     shift_mm: np.ndarray
     """(3,) by which everything was moved (mm)."""
-    lesion_mm: np.ndarray | None
-    """(V, 3) surface of a segmented lesion, world frame, mm; None without one."""
+    lesion: SegmentedLesion | None
+    """A segmented lesion, world frame; None without one."""
     notes: tuple[str, ...]
     """Units, directions and repairs, one line each."""
 
@@ -226,7 +236,7 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
     names: list[str] = []
     roles, meshes, holes_mm, frames_to_world = [], [], [], []
     operable: list[int] = []
-    lesion_mm: np.ndarray | None = None
+    lesion: SegmentedLesion | None = None
     unit: LengthUnit | None = None
     for i, (path, role) in enumerate(zip(request.meshes, request.roles, strict=True)):
         on_step = partial(_report_step, report, i, len(request.meshes), path.name)
@@ -236,8 +246,8 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
             image = read_segmentation(path, request.labels, on_step)
             parts, part_roles, scale = image.parts, image.roles, 1.0
             notes += image.notes
-            if image.lesion_mm is not None:
-                lesion_mm = image.lesion_mm @ UP[up].T
+            if image.lesion is not None:
+                lesion = image.lesion.moved(UP[up], np.zeros(3))
         else:
             parts = read_parts(path)
             part_roles = tuple(role for _ in parts)
@@ -261,7 +271,7 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
     bounds = meshes[0].bounds_mm
     middle, size = bounds.mean(axis=0), np.ptp(bounds, axis=0).max()
     shift = np.zeros(3)
-    if np.linalg.norm(middle) > FAR_OFF * size or lesion_mm is not None:
+    if np.linalg.norm(middle) > FAR_OFF * size or lesion is not None:
         shift = -middle
         meshes = [Mesh(mesh.vertices_mm + shift, mesh.faces) for mesh in meshes]
         notes.append(f"moved by {tuple(shift.round(3).tolist())} mm to the origin")
@@ -276,7 +286,7 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
         tuple(holes_mm),
         frames_to_world[0],
         shift,
-        None if lesion_mm is None else lesion_mm + shift,
+        None if lesion is None else lesion.moved(np.eye(3), shift),
         tuple(notes),
     )
 
@@ -418,8 +428,8 @@ def choose_sites(request: Request, prepared: Prepared) -> list[Site]:
     if request.lesion_direction is not None:
         direction = prepared.to_world @ np.asarray(request.lesion_direction)
         return [directed_site(operable, direction, diameter_mm)]
-    if prepared.lesion_mm is not None:
-        point, _, _ = segmented_lesion(prepared)
+    if prepared.lesion is not None:
+        point = seen_lesion(request, prepared).point_mm
         return [pointed_site(operable[:1], point, diameter_mm, "the segmented lesion")]
     return good_sites(surfaces, diameter_mm)
 
@@ -435,30 +445,86 @@ def ring_diameter(request: Request, prepared: Prepared) -> float:
     """Diameter of the ring (mm): the given one, or around the segmented lesion, or DIAMETER_MM."""
     if request.diameter_mm is not None:
         return request.diameter_mm
-    if prepared.lesion_mm is None or request.lesion or request.lesion_direction:
+    if prepared.lesion is None or request.lesion or request.lesion_direction:
         return DIAMETER_MM
-    _, radius, _ = segmented_lesion(prepared)
-    margin_mm = MARGIN_MM if request.margin_mm is None else request.margin_mm
-    return round(2.0 * (radius + margin_mm), 1)
+    return seen_lesion(request, prepared).ring_mm
 
 
-def segmented_lesion(prepared: Prepared) -> tuple[np.ndarray, float, float]:
-    """Where a segmented lesion meets the organ's surface: point, radius and depth.
+@dataclass(frozen=True, eq=False)
+class SeenLesion:
+    """A segmented lesion as seen along the normal of its ring."""
 
-    The point (3,) mm of the organ's surface nearest to the lesion's middle; the largest distance
-    of the lesion from the surface's normal through that point (mm); and the lesion's smallest
-    depth below the surface (mm).
+    point_mm: np.ndarray
+    """(3,) mm: point of the organ's surface over the middle of the lesion, the ring's centre."""
+    radius_mm: float
+    """Radius of the smallest circle around its voxels' centres (mm)."""
+    ring_mm: float
+    """Diameter of the ring around it with the margin, or the one that was given (mm)."""
+    depth_mm: float
+    """Least distance of its surface from the organ's (mm)."""
+
+
+def seen_lesion(request: Request, prepared: Prepared) -> SeenLesion:
+    """Where the ring of a segmented lesion goes, and how large the lesion is as seen from there.
+
+    The normal of a ring is the mean of the surface inside it, so its centre and its size depend on
+    each other: both are found by turns, from the surface point nearest to the lesion's middle.
     """
-    lesion, organ = prepared.lesion_mm, prepared.meshes[0]
+    lesion, organ = prepared.lesion, prepared.meshes[0]
     assert lesion is not None, "the image holds a lesion"
-    middle = lesion.mean(axis=0)
-    points, faces = nearest_on_surface(organ, middle[None])
-    normal = patch_normal(organ, points[0], int(faces[0]), MARGIN_MM)
-    away = lesion - points[0]
-    across = away - np.outer(away @ normal, normal)
-    near, _ = nearest_on_surface(organ, lesion[:: max(1, len(lesion) // 500)])
-    depth = np.linalg.norm(near - lesion[:: max(1, len(lesion) // 500)], axis=1).min()
-    return points[0], float(np.linalg.norm(across, axis=1).max()), float(depth)
+    margin_mm = MARGIN_MM if request.margin_mm is None else request.margin_mm
+    middle = lesion.voxels_mm.mean(axis=0)
+    spread = float(np.linalg.norm(lesion.voxels_mm - middle, axis=1).max())
+    point, face = (part[0] for part in nearest_on_surface(organ, middle[None]))
+    given = request.diameter_mm
+    ring_mm = given or round(2.0 * (spread + margin_mm), 1)
+    radius = spread
+    for _ in range(CENTRING_STEPS):
+        normal = patch_normal(organ, point, int(face), 0.5 * ring_mm)
+        plane = frames.rotation_from_z(normal)[:, :2]
+        aside, radius = enclosing_circle((lesion.voxels_mm - point) @ plane)
+        ring_mm = given or round(2.0 * (radius + margin_mm), 1)
+        flat = (point + plane @ aside)[None]
+        height, under = dropped(organ, flat, point, normal, 4.0 * (ring_mm + spread))
+        if under[0] < 0:
+            break
+        point, face = (flat + height[:, None] * normal)[0], under[0]
+        if np.linalg.norm(aside) < CENTRED_MM:
+            break
+    sampled = lesion.surface_mm[:: max(1, len(lesion.surface_mm) // 500)]
+    near, _ = nearest_on_surface(organ, sampled)
+    depth = float(np.linalg.norm(near - sampled, axis=1).min())
+    return SeenLesion(point, radius, ring_mm, depth)
+
+
+def enclosing_circle(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Centre (2,) and radius of the smallest circle around plane points (N, 2).
+
+    Each point outside of the circle of the points before it lies on the circle's edge (Welzl 1991).
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        points = points[ConvexHull(points).vertices]
+    except (QhullError, ValueError):  # few points, or all on a line
+        points = np.unique(points, axis=0)
+    points = np.random.default_rng(0).permutation(points)
+
+    def around(edge: list[np.ndarray]) -> tuple[np.ndarray, float]:
+        first = edge[0]
+        sides = np.array([other - first for other in edge[1:]]).reshape(-1, 2)
+        away = np.linalg.lstsq(2.0 * sides, (sides**2).sum(axis=1), rcond=None)[0]
+        return first + away, float(np.linalg.norm(away))
+
+    def smallest(count: int, edge: list[np.ndarray]) -> tuple[np.ndarray, float]:
+        centre, radius = around(edge) if edge else (points[0], 0.0)
+        for i in range(count):
+            outside = np.linalg.norm(points[i] - centre) > radius * (1.0 + 1e-9) + 1e-9
+            if outside and len(edge) < 3:
+                centre, radius = smallest(i, [*edge, points[i]])
+        return centre, radius
+
+    return smallest(len(points), [])
 
 
 def author(
@@ -600,12 +666,14 @@ def _chosen(
     cuts = check.work.cuts.values()
     centre = ", ".join(f"{x:.1f}" for x in scene.spec.lesion.centre_mm)
     moved = f"the given point was {site.moved_mm:.3g} mm off the surface and was moved onto it"
-    segmented, nearer = prepared.lesion_mm is not None, _nearer_body(request, prepared, site)
-    if segmented:
-        _, radius, depth = segmented_lesion(prepared)
+    segmented, nearer = prepared.lesion is not None, _nearer_body(request, prepared, site)
+    if prepared.lesion is not None:
+        seen = seen_lesion(request, prepared)
+        voxel_mm = prepared.lesion.voxel_mm
         moved = (
-            f"segmented lesion: {2.0 * radius:.3g} mm across seen from the surface, its top "
-            f"{depth:.2g} mm below it"
+            f"segmented lesion: {2.0 * seen.radius_mm:.3g} mm across seen from the surface between "
+            f"the centres of its voxels (up to {voxel_mm:.2g} mm more to their edges), its top "
+            f"{seen.depth_mm:.2g} mm below it"
         )
     return [
         *([moved] if segmented or site.moved_mm > REPORTED_FROM_MM else []),

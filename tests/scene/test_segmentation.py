@@ -3,13 +3,22 @@
 import gzip
 import itertools
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from surgisoft.cli import run
 from surgisoft.errors import InputError
-from surgisoft.scene.author import Request, choose_sites, prepare, ring_diameter
+from surgisoft.scene import frames
+from surgisoft.scene.author import (
+    Request,
+    choose_sites,
+    enclosing_circle,
+    prepare,
+    ring_diameter,
+    seen_lesion,
+)
 from surgisoft.scene.folder import open_scene
 from surgisoft.scene.inside import winding_numbers
 from surgisoft.scene.mesh import Mesh
@@ -99,8 +108,8 @@ def test_surfaces_have_the_size_and_place_of_the_bodies(read):
     assert vessel.volume_mm3 == pytest.approx(voxels, rel=0.1)
     middle = organ.vertices_mm.mean(axis=0)
     np.testing.assert_allclose(middle, [0.0, 0.0, 300.0], atol=1.0)
-    np.testing.assert_allclose(read.lesion_mm.mean(axis=0), LESION, atol=0.3)
-    radius = np.linalg.norm(read.lesion_mm - LESION, axis=1)
+    np.testing.assert_allclose(read.lesion.surface_mm.mean(axis=0), LESION, atol=0.3)
+    radius = np.linalg.norm(read.lesion.surface_mm - LESION, axis=1)
     assert abs(radius.mean() - 8.0) < 0.3
     # the voxels of lesion and vessel belong to the solid organ
     inside = winding_numbers(organ, np.array([LESION, [0.0, 0.0, 290.0], [20.0, 0.0, 290.0]]))
@@ -140,7 +149,7 @@ def test_an_image_without_orientation_is_not_mirrored(read, tmp_path):
     found = read_segmentation(file, LABELS)
     assert any("right, anterior, superior" in note for note in found.notes)
     place = np.array(LESION) - ORIGIN
-    np.testing.assert_allclose(found.lesion_mm.mean(axis=0), place, atol=0.3)
+    np.testing.assert_allclose(found.lesion.surface_mm.mean(axis=0), place, atol=0.3)
 
 
 def test_the_headers_unit_counts(read, tmp_path):
@@ -217,7 +226,7 @@ def test_slicers_segments_have_names_and_may_overlap(tmp_path):
     path = tmp_path / "ct.seg.nrrd"
     nrrd.write(str(path), layers, header)
     read = read_segmentation(path, (parse_label("liver:organ"), parse_label("tumour:lesion")))
-    np.testing.assert_allclose(read.lesion_mm.mean(axis=0), LESION, atol=0.3)
+    np.testing.assert_allclose(read.lesion.surface_mm.mean(axis=0), LESION, atol=0.3)
     assert [part.name for part in read.parts] == ["liver"]
     assert not any("left out: " in note for note in read.notes)
     by_value = read_segmentation(path, (parse_label("1:organ"), parse_label("tumour:lesion")))
@@ -233,15 +242,67 @@ def test_the_ring_lies_above_the_lesion_with_its_margin(nifti):
     """The patient lies on the back: anterior is up, and the ball lies 12 mm below the surface."""
     request = Request((nifti,), ("organ",), labels=LABELS, margin_mm=4.0)
     prepared = prepare(request)
-    assert ring_diameter(request, prepared) == pytest.approx(2.0 * (8.0 + 4.0), abs=2.0)
+    assert ring_diameter(request, prepared) == pytest.approx(2.0 * (8.0 + 4.0), abs=0.7)
     (site,) = choose_sites(request, prepared)
-    organ = prepared.meshes[0]
-    middle = prepared.lesion_mm.mean(axis=0)
+    middle = prepared.lesion.surface_mm.mean(axis=0)
     # world x right, z anterior, so y to the feet; the origin is the middle of the organ
     np.testing.assert_allclose(middle, [8.0, 0.0, 38.0], atol=1.5)
     assert site.point_mm[2] > middle[2]
-    distances = np.linalg.norm(organ.vertices_mm - middle, axis=1)
-    assert np.linalg.norm(site.point_mm - middle) <= distances.min() + 0.1
+    assert across_mm(site, middle) < 0.4
+
+
+def across_mm(site, points_mm):
+    """Distance of points (..., 3) mm from the axis of a site's ring, mm."""
+    away = np.asarray(points_mm) - site.point_mm
+    along = away @ site.ring.normal
+    return np.linalg.norm(away - along[..., None] * site.ring.normal, axis=-1)
+
+
+@pytest.mark.parametrize(
+    ("voxel_mm", "radius_mm"), [(0.75, 4.0), (1.0, 8.0), (1.5, 8.0), (2.0, 8.0)]
+)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_ball_off_the_grid_has_its_size_and_the_ring_its_margin(
+    voxel_mm, radius_mm, seed, tmp_path
+):
+    """A ball 2 mm below the surface of an ellipsoid of 60 x 48 x 44 mm, both at random places.
+
+    The size is that between the voxels' centres: at most a voxel smaller than the ball, and never
+    larger. The margin holds all around to half a voxel."""
+    rng, semi = np.random.default_rng(seed), np.array([30.0, 24.0, 22.0])
+    counts = np.ceil(2.0 * semi / voxel_mm + 6.0).astype(int)
+    grid = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), -1) * voxel_mm
+    middle = 0.5 * voxel_mm * (counts - 1) + rng.uniform(-0.5, 0.5, 3) * voxel_mm
+    side = frames.normalise(rng.normal(size=3) * [0.5, 0.0, 0.5] + [0.0, 1.0, 0.0])
+    ball = middle + side * (1.0 / np.linalg.norm(side / semi) - radius_mm - 2.0)
+    labels = (np.linalg.norm((grid - middle) / semi, axis=-1) < 1.0).astype(np.uint8)
+    labels[np.linalg.norm(grid - ball, axis=-1) < radius_mm] = 2
+    image = write_nifti(tmp_path / "ball.nii.gz", labels, np.diag([*[voxel_mm] * 3, 1.0]))
+    request = Request((image,), ("organ",), labels=LABELS[:2], margin_mm=5.0)
+    prepared = prepare(request)
+    seen = seen_lesion(request, prepared)
+    assert -voxel_mm <= 2.0 * (seen.radius_mm - radius_mm) <= 1e-6
+    assert seen.depth_mm == pytest.approx(2.0, abs=0.5 * voxel_mm + 0.3)
+    (site,) = choose_sites(request, prepared)
+    true = prepared.to_world @ ball + prepared.shift_mm
+    margin = across_mm(replace(site, point_mm=true), site.ring.points_mm) - radius_mm
+    assert np.abs(margin - 5.0).max() <= 0.5 * voxel_mm
+    assert across_mm(site, true) <= 0.2 * voxel_mm + 0.05
+
+
+def test_the_smallest_circle_around_points():
+    """Two points, a triangle with an obtuse angle, one on a circle with points inside."""
+    cases = (
+        ([[0.0, 0.0], [6.0, 8.0]], [3.0, 4.0], 5.0),
+        ([[0.0, 0.0], [10.0, 0.0], [5.0, 1.0]], [5.0, 0.0], 5.0),
+        ([[3.0, 0.0], [0.0, 3.0], [-3.0, 0.0], [1.0, 1.0], [0.0, -2.0]], [0.0, 0.0], 3.0),
+        ([[2.0, 1.0]] * 4, [2.0, 1.0], 0.0),
+        ([[0.0, 0.0], [1.0, 1.0], [4.0, 4.0]], [2.0, 2.0], 8.0**0.5),
+    )
+    for points, centre, radius in cases:
+        found, size = enclosing_circle(np.array(points))
+        np.testing.assert_allclose(found, centre, atol=1e-9)
+        assert size == pytest.approx(radius, abs=1e-9)
 
 
 @pytest.mark.parametrize(

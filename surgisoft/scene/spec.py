@@ -191,19 +191,42 @@ class ContourSpec:
         return replace(self, points_mm=points, file="")
 
 
+COLUMNS = ("x", "y", "z")
+"""Columns of a contour's file, mm."""
+
+
 def _points_of(path: Path, where: Where) -> tuple[tuple[float, float, float], ...]:
     """The columns x, y and z of a CSV file, mm."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file))
-        points = [(float(row["x"]), float(row["y"]), float(row["z"])) for row in rows]
-    except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not such a file"
+            table = csv.reader(file, skipinitialspace=True)
+            header = [name.strip() for name in next(table, [])]
+            rows = [(table.line_num, row) for row in table if row]
+    except OSError as error:
         raise where.error(
-            f"{path} cannot be read ({reason})", "a CSV file with the columns x, y, z in mm"
+            f"{path} cannot be read ({error.strerror})", "a CSV file with the columns x, y, z in mm"
         ) from None
-    if not np.isfinite(points).all():
-        raise where.error(f"{path} has a coordinate that is not finite", "numbers in mm")
+    except (UnicodeDecodeError, csv.Error):
+        raise where.error(
+            f"{path} is no text of comma-separated values", "a CSV file with the columns x, y, z"
+        ) from None
+    if lacking := [name for name in COLUMNS if name not in header]:
+        has = ", ".join(header)[:60] or "nothing"
+        raise where.error(
+            f"{path} has no column {', '.join(lacking)}; its first line is: {has}",
+            "a first line with the columns x, y, z in mm, separated by commas",
+        )
+    places, points = [header.index(name) for name in COLUMNS], []
+    for line, row in rows:
+        try:
+            x, y, z = (float(row[place]) for place in places)
+        except (ValueError, IndexError):
+            raise where.error(
+                f"line {line} of {path} is: {','.join(row)[:60]}", "numbers for x, y and z in mm"
+            ) from None
+        if not np.isfinite((x, y, z)).all():
+            raise where.error(f"line {line} of {path} has a number that is not finite", "mm")
+        points.append((x, y, z))
     return tuple(points)
 
 

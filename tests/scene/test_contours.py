@@ -162,10 +162,35 @@ def test_points_come_from_a_table_beside_the_file(plane, tmp_path):
     read = from_table(ContourSpec, {"name": "c", "file": "line.csv", "closed": False}, where)
     assert read.points_mm == ((0.0, 0.0, 5.0), (3.0, 4.0, 5.0))
     assert contour_path(plane, read, 0.5).length_mm == pytest.approx(5.0)
-    for text in ("x,y\n1,2\n", "x,y,z\n1,2,nan\n3,4,5\n", "x,y,z\n1,2,?\n"):
-        (tmp_path / "line.csv").write_text(text)
-        with pytest.raises(InputError, match=r"c\.toml: file: .*line\.csv"):
-            from_table(ContourSpec, {"name": "c", "file": "line.csv", "closed": False}, where)
+    (tmp_path / "line.csv").write_text(" z, y ,x,note\n5,4,3,end\n\n5,0,0,\n")
+    read = from_table(ContourSpec, {"name": "c", "file": "line.csv", "closed": False}, where)
+    assert read.points_mm == ((3.0, 4.0, 5.0), (0.0, 0.0, 5.0))
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (
+            b"x,y\n1,2\n",
+            r"line\.csv has no column z; its first line is: x, y; expected a first line",
+        ),
+        (b"1,2,3\n4,5,6\n", r"has no column x, y, z; its first line is: 1, 2, 3; expected"),
+        (b"x;y;z\n1;2;3\n", r"has no column x, y, z; its first line is: x;y;z; .* commas"),
+        (b"", "has no column x, y, z; its first line is: nothing"),
+        (b"x,y,z\n1,2,3\n1,2,?\n", r"line 3 of .*line\.csv is: 1,2,\?; expected numbers for x, y"),
+        (b"x,y,z\n1,2\n", r"line 2 of .*line\.csv is: 1,2; expected numbers"),
+        (b"x,y,z\n1,2,nan\n3,4,5\n", r"line 2 of .*line\.csv has a number that is not finite"),
+        (b"x,y,z\n\xff\xfe\n", r"line\.csv is no text of comma-separated values"),
+        (None, r"line\.csv cannot be read \(No such file or directory\)"),
+    ],
+)
+def test_a_table_that_holds_no_points_says_what_it_holds(content, said, tmp_path):
+    if content is not None:
+        (tmp_path / "line.csv").write_bytes(content)
+    where = Where(tmp_path / "c.toml")
+    with pytest.raises(InputError, match=r"c\.toml: file: .*" + said) as raised:
+        from_table(ContourSpec, {"name": "c", "file": "line.csv", "closed": False}, where)
+    assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ import numpy as np
 from surgisoft.compiled import compiled
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
-from surgisoft.scene.contours import SurfacePath, inside_outline
+from surgisoft.scene.contours import SurfacePath, inside_outline, resampled
 from surgisoft.scene.inside import buried
 from surgisoft.scene.mesh import Mesh
 
@@ -32,6 +32,8 @@ MOST_SAMPLES = 400_000
 """A patch that needs more samples than this is an error."""
 
 
+COINCIDE_MM = 0.05
+"""Two paths nearer to each other than this coincide (mm)."""
 MARGIN_MM = 4.0
 """How far a patch reaches beyond the ring, the path, or the margin that is spared (mm). Tissue that
 is ablated farther out is no part of any area."""
@@ -172,6 +174,7 @@ def path_patch(
     else up to margin_mm from the paths. With band_mm 0 there is no ring; see `area_patch` for one
     outside of the outline only. Each path has stations of about station_mm, one path after another.
     """
+    _check_apart(paths, band_mm)
     samples = _path_samples(mesh, paths, spacing_mm, margin_mm)
     zone = np.where(np.abs(samples.offset) <= 0.5 * band_mm, RING, samples.side)
     patch = samples.patch(mesh, zone, spacing_mm, station_mm)
@@ -181,6 +184,22 @@ def path_patch(
             f"dose patch: {missed} stretches of the paths have no surface below them; move them"
         )
     return patch
+
+
+def _check_apart(paths: Sequence[SurfacePath], most_mm: float) -> None:
+    """Raise an InputError for two paths that coincide over a length of more than most_mm."""
+    from scipy.spatial import cKDTree
+
+    for i, one in enumerate(paths):
+        for other in paths[:i]:
+            line = np.vstack((other.points_mm, other.points_mm[: int(other.closed)]))
+            away, _ = cKDTree(resampled(line, COINCIDE_MM)).query(one.points_mm)
+            along = one.length_mm * float((away <= COINCIDE_MM).mean())
+            if along > most_mm:
+                raise InputError(
+                    f"contours '{other.name}' and '{one.name}' coincide over {along:.3g} mm; "
+                    "expected contours that at most cross: leave one out, or move it"
+                )
 
 
 def area_patch(

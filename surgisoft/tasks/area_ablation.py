@@ -32,7 +32,7 @@ from surgisoft.tasks.spec import TaskSpec
 from surgisoft.tasks.supervision import Condition
 from surgisoft.tasks.trajectories.routes import RouteProgress, draw_route, route_steps
 from surgisoft.tasks.world.random_streams import Stream
-from surgisoft.tasks.world.treatment import AreaPlan, ContourSpec
+from surgisoft.tasks.world.treatment import AreaPlan, ContourSpec, check_names
 
 TREATED = Block("treated", "share of the lesions' area that has the dose", "-", "x", 0.0, 1.0)
 TREATED_SHARE = Signal(
@@ -108,6 +108,7 @@ class AreaAblationConfig(LaserConfig):
     def __post_init__(self):
         positive = ("dose_j_per_mm2", "treated_share", "spot_mm", "pitch_mm", "speed_mm_s")
         check_config("area_ablation", self, *positive, "time_s", "spared_mm")
+        check_names("area_ablation: outlines", self.outlines)
         for name in ("healthy_mm2", "overrun_mm"):
             if not getattr(self, name) >= 0.0:
                 raise InputError(f"area_ablation: {name} is {getattr(self, name)}, expected >= 0")

@@ -27,7 +27,7 @@ from surgisoft.tasks.laser_work import (
 from surgisoft.tasks.spec import TaskSpec
 from surgisoft.tasks.trajectories.routes import RouteProgress, draw_route, route_steps
 from surgisoft.tasks.world.random_streams import Stream
-from surgisoft.tasks.world.treatment import ContourPlan, ContourSpec
+from surgisoft.tasks.world.treatment import ContourPlan, ContourSpec, check_names
 
 OVERLAP_MM = 2.0
 """Length by which a closed cut passes its beginning again, mm: the seam is cut twice."""
@@ -63,6 +63,7 @@ class ContourAblationConfig(LaserConfig):
     def __post_init__(self):
         positive = ("speed_mm_s", "window_mm", "field_deg", "time_s")
         check_config("contour_ablation", self, *positive)
+        check_names("contour_ablation: contours", self.contours)
         if not self.margin_mm >= 0.0:
             raise InputError(f"contour_ablation: margin_mm is {self.margin_mm}, expected >= 0")
 

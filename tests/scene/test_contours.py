@@ -240,3 +240,18 @@ def test_an_outline_that_crosses_itself_has_no_inside(plane):
         path_patch(plane, (closed,), 0.3)
     followed = contour_path(plane, spec(points_mm=[*points, points[0]], closed=False), 0.2)
     assert not (path_patch(plane, (followed,), 0.3).zone == LESION).any()
+
+
+def test_contours_that_coincide_are_named_with_the_length(plane):
+    """A circle of 6 mm twice: 37.7 mm; half of it again: 18.8 mm; a line through it crosses it."""
+    one, other = (laid(plane, disc(6.0), True, 0.2, name) for name in ("a", "b"))
+    line = laid(plane, np.array([[-9.0, 0.0, 5.0], [9.0, 0.0, 5.0]]), False, 0.2, "line")
+    with pytest.raises(InputError, match="contours 'a' and 'b' coincide over") as raised:
+        path_patch(plane, (one, other), 0.3, band_mm=2.0)
+    length = float(str(raised.value).split(" over ")[1].split(" mm")[0])
+    assert length == pytest.approx(12.0 * math.pi, abs=0.3)
+    half = laid(plane, disc(6.0)[:360], False, 0.2, "half")
+    with pytest.raises(InputError, match=r"contours 'a' and 'half' .* over 18\.[5-9]"):
+        path_patch(plane, (one, half), 0.3, band_mm=2.0)
+    patch = path_patch(plane, (one, line), 0.3, band_mm=2.0)
+    assert patch.ring_length_mm == pytest.approx(12.0 * math.pi + 18.0, rel=1e-3)

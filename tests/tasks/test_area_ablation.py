@@ -118,5 +118,7 @@ def test_what_does_not_fit_is_one_line():
         AreaAblation(replace(SPOT, dose_j_per_mm2=0.1))
     with pytest.raises(InputError, match=r"raster takes .* and time_s is 1 s"):
         AreaAblation(replace(SPOT, time_s=1.0))
+    with pytest.raises(InputError, match="outlines: a second contour 'spot'"):
+        AreaAblationConfig(outlines=SPOT.outlines * 2)
     with pytest.raises(InputError, match=r"treated_share is 1\.5"):
         replace(SPOT, treated_share=1.5)

@@ -145,6 +145,8 @@ def test_what_does_not_fit_is_one_line():
         ContourAblation(ContourAblationConfig(contours=LINES, speed_mm_s=4.0, time_s=1.0))
     with pytest.raises(InputError, match="margin_mm is -1"):
         ContourAblationConfig(margin_mm=-1.0)
+    with pytest.raises(InputError, match="contours: a second contour 'left'; expected names that"):
+        ContourAblationConfig(contours=(*LINES, LINES[0]))
     varied = ContourAblationConfig(contours=LINES)
     vary = replace(varied.world.randomisation, lesion_mm=2.0)
     with pytest.raises(InputError, match="leave both at 0 for contours"):

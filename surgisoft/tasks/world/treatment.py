@@ -236,6 +236,13 @@ class AreaPlan:
         )
 
 
+def check_names(field: str, contours: Sequence[ContourSpec]) -> None:
+    """Raise an InputError that names the field where two contours have one name."""
+    names = [contour.name for contour in contours]
+    if twice := [name for i, name in enumerate(names) if name in names[:i]]:
+        raise InputError(f"{field}: a second contour '{twice[0]}'; expected names that differ")
+
+
 def outlines(
     scene: Scene, contours: Sequence[ContourSpec], margin_mm: float, step_mm: float
 ) -> tuple[SurfacePath, ...]:

@@ -8,7 +8,15 @@ import typer
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder, show_written
 from surgisoft.cli.inputs import warn
-from surgisoft.cli.options import EffectFiles, Force, Port, SaveReplay, Screenshot, Web
+from surgisoft.cli.options import (
+    EffectFiles,
+    Force,
+    Port,
+    SaveReplay,
+    Screenshot,
+    Web,
+    with_effect_files,
+)
 from surgisoft.cli.progress import progress
 from surgisoft.command_line import typed
 from surgisoft.errors import InputError
@@ -154,7 +162,8 @@ def new(
     for note in made.notes:
         print(note)
     _print_check(made.check)
-    print(f"wrote {output}: view it with 'surgisoft scene show {typed(output)}'")
+    shown = with_effect_files(f"surgisoft scene show {typed(output)}")
+    print(f"wrote {output}: view it with '{shown}'")
     return 0
 
 

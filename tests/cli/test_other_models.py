@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 
 from surgisoft.cli import run
 from surgisoft.diagnosis.other_models import open_model
@@ -17,7 +18,7 @@ from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import load_recording, save_recording
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.callables import named
-from surgisoft.surrogate.checkpoint import load_model
+from surgisoft.surrogate.checkpoint import load_model, save_model
 from tests.cli.test_printed import diagnosis, result
 from tests.replay.reading import entities
 from tests.test_your_model import blocks
@@ -162,6 +163,35 @@ def test_an_amended_callable_is_a_model_folder(capsys, tmp_path):
     assert run(evaluate) == 2
     assert run([*evaluate, *code]) == 0
     assert run([*f"compare {new} bench.parquet".split(), *code]) == 0
+
+
+def test_a_callable_arm_of_a_scene_states_its_length(capsys, tmp_path):
+    """Without it the message names the attribute; with it the printed next command opens."""
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=50.0)
+    ball.export(tmp_path / "organ.stl")
+    text = Path("my_arm.py").read_text()
+    assert "length_mm" not in text
+    Path("sized.py").write_text(
+        text.replace(
+            "    static = True", "    length_mm, diameter_mm = 70.0, 15.0\n    static = True"
+        )
+    )
+    for name, code in (("plain", "my_arm.py:arm"), ("arm", "sized.py:arm")):
+        named.NAMED.clear()
+        save_model(load_model(code), tmp_path / name)
+        make = f"scene new {tmp_path}/organ.stl --arms endoscope --arm {tmp_path / name}"
+        done = run([*make.split(), "--model-code", code, "-o", str(tmp_path / f"s_{name}")])
+        said = capsys.readouterr()
+        if name == "plain":
+            assert done == 2
+            assert "give the object my_arm.py:arm the attribute length_mm (the length" in said.err
+            continue
+        assert done == 0, said.err
+        line = said.out.splitlines()[-1]
+        show = line.partition("'surgisoft ")[2].removesuffix("'")
+        assert show.endswith(" --model-code sized.py:arm")
+        named.NAMED.clear()
+        assert run([*show.split(), "--save", str(tmp_path / "view.rrd")]) == 0
 
 
 def test_what_follows_an_amended_callable_runs_as_it_is_printed(capsys, tmp_path, monkeypatch):

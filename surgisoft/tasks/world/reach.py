@@ -21,7 +21,9 @@ from surgisoft.scene.reach import ArmReach
 from surgisoft.scene.spec import FILE, TOOLS, MountSpec, arm_names, arm_rank
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.callables.named import is_callable_name
+from surgisoft.surrogate.callables.network import CallableNetwork
 from surgisoft.surrogate.checkpoint import default_arm, load_model
+from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.reach import grid_axes, model_table
 from surgisoft.tasks.world.scene import SceneEngineConfig
 
@@ -85,11 +87,11 @@ def blank_mounts(
                 f"and give --arm my_arm --model-code {model}"
             )
         if model != "default":
-            spec = load_model(model).spec
+            opened = load_model(model)
+            spec = opened.spec
             if spec.length_mm is None:
                 raise InputError(
-                    f"{model}: the arm model states no length; fit it to recordings whose sidecar "
-                    "has length_mm in [arm]"
+                    f"{model}: the arm model states no length; {_how_to_state(opened)}"
                 )
             mount = replace(
                 mount,
@@ -99,6 +101,16 @@ def blank_mounts(
             )
         mounts[name] = mount
     return mounts
+
+
+def _how_to_state(model: ArmModel) -> str:
+    """How an arm model gets the length that a mount needs."""
+    if isinstance(model.network, CallableNetwork):
+        return (
+            f"give the object {model.network.named.name} the attribute length_mm (the length at "
+            "rest, mm) and save it again"
+        )
+    return "fit it to recordings whose sidecar has length_mm in [arm]"
 
 
 def reaches_of(scene: Scene) -> dict[str, ArmReach]:

@@ -293,8 +293,9 @@ def _request(meshes, lesion, direction, diameter, clearance, **frame):
 
     `frame` holds the fields of `Request` that tell how the files are to be read.
     """
-    from surgisoft.scene.author import Request
+    from surgisoft.scene.author import Request, no_lesion_mesh
     from surgisoft.scene.mesh import ROLES
+    from surgisoft.scene.segmentation import is_segmentation
     from surgisoft.scene.spec import LimitsSpec
 
     paths, roles = [], []
@@ -302,6 +303,8 @@ def _request(meshes, lesion, direction, diameter, clearance, **frame):
         path, colon, role = text.rpartition(":")
         if not colon or Path(text).exists() or "/" in role:
             path, role = text, "organ" if i == 0 else "keep-out"
+        elif role == "lesion" and not is_segmentation(Path(path)):
+            raise no_lesion_mesh(Path(path))
         elif role not in ROLES:
             raise InputError(f"{text}: role '{role}'; expected one of {', '.join(ROLES)}")
         paths.append(Path(path))

@@ -41,7 +41,7 @@ from surgisoft.scene.meshio import (
 from surgisoft.scene.mounted_arm import RingSolution
 from surgisoft.scene.mounts import Arrangement, find_mounts
 from surgisoft.scene.reach import ArmReach
-from surgisoft.scene.repair import repair
+from surgisoft.scene.repair import INNER_BODIES, repair
 from surgisoft.scene.segmentation import (
     Label,
     SegmentedLesion,
@@ -90,6 +90,12 @@ COARSE_RING = 36
 """Number of ring points during the search for mounts."""
 CROSSING = "the surface intersects itself, only its outermost part counts; faces inside the solid"
 """Note on a body whose surface intersects itself; the number of faces follows."""
+
+
+INNER_HINT = (
+    " (where one was a lesion, place it by --lesion X Y Z; a vessel belongs into a file of its own)"
+)
+"""Hint behind the number of bodies that lay inside another one."""
 
 
 @dataclass(frozen=True)
@@ -358,9 +364,11 @@ def _closed_bodies(path, parts, to_world, notes, on_step) -> list[_NamedBody]:
             found, failures, done = together, [], done_together
     if not found:
         raise failures[0]
-    usual = " (an STL repeats every corner)" if path.suffix.lower() == ".stl" else ""
+    usual = {INNER_BODIES: INNER_HINT}
+    if path.suffix.lower() == ".stl":
+        usual["duplicate vertices joined"] = " (an STL repeats every corner)"
     for what, count in done.items():
-        note = usual if what == "duplicate vertices joined" else ""
+        note = usual.get(what, "")
         notes.append(f"{path.name}: {what}: {count}{note}")
     notes += [f"left out: {error}" for error in failures]
     return found
@@ -689,6 +697,20 @@ def _beams(cuts: list[RingSolution]) -> str:
     low, high = min(c.standoff_mm.min() for c in cuts), max(c.standoff_mm.max() for c in cuts)
     steepest = np.degrees(max(cut.incidence_rad.max() for cut in cuts))
     return f"beam {low:.0f} to {high:.0f} mm long, incidence up to {steepest:.0f} degrees"
+
+
+def no_lesion_mesh(path: Path) -> InputError:
+    """The error for a mesh file that was given as a lesion, with the point to give instead."""
+    corners = np.concatenate(
+        [part.vertices[used_indices(part.faces)[0]] for part in read_parts(path)]
+    )
+    middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+    across = float(np.ptp(corners, axis=0).max())
+    return InputError(
+        f"{path}: a lesion is a ring on the organ's surface, and no mesh; expected --lesion "
+        f"{' '.join(f'{x:.4g}' for x in middle)} (the middle of this mesh, which is {across:.3g} "
+        "across) and --diameter, or a segmented image with --label LABEL:lesion"
+    )
 
 
 def check_target(folder: Path, force: bool) -> None:

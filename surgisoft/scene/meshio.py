@@ -44,6 +44,10 @@ class Part:
     """(F, 3) int64, rows of vertex indices."""
 
 
+DICOM = (".dcm", ".dicom", ".ima")
+"""Suffixes of DICOM images, which hold grey values."""
+
+
 def read_parts(path: str | Path) -> tuple[Part, ...]:
     """All triangle meshes of a file, in the file's unit and frame."""
     path = Path(path)
@@ -51,6 +55,11 @@ def read_parts(path: str | Path) -> tuple[Part, ...]:
         raise InputError(f"{path}: there is no such file; expected a mesh")
     if path.is_dir():
         raise InputError(f"{path}: is a folder; expected a mesh file ({', '.join(SUFFIXES)})")
+    if path.suffix.lower() in DICOM:
+        raise InputError(
+            f"{path}: a DICOM image is not read, because a scene needs labels; segment it, with 3D "
+            "Slicer for example, and save the segmentation as NIfTI (.nii.gz) or NRRD (.nrrd)"
+        )
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(
             f"{path}: file type '{path.suffix}' is not read; expected one of "

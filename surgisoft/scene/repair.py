@@ -26,6 +26,8 @@ OPEN_SPECK = 0.1
 """An open piece smaller than this fraction of the whole size is a speck and is removed."""
 HOLE = 0.3
 """A hole wider than this fraction of its body is an error and is not closed."""
+INNER_BODIES = "inner bodies removed"
+"""What was done to bodies that lie inside another one; their number follows."""
 MOST_BODIES = 16
 """Largest number of separate bodies in one part; more mean a broken file."""
 
@@ -414,7 +416,7 @@ def _drop_inner(shells: list[_Shell], log) -> list[_Shell]:
     for shell in shells:
         if not any(_lies_inside(shell, outer) for outer in kept):
             kept.append(shell)
-    log["inner bodies removed"] = len(shells) - len(kept)
+    log[INNER_BODIES] = len(shells) - len(kept)
     return kept
 
 

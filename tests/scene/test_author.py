@@ -366,6 +366,37 @@ def test_contours_are_checked_as_the_ring_is(made, tmp_path, capsys):
     assert finding(crossed, "contour 'open_eight' in the laser's reach").value == "100 %"
 
 
+def test_a_lesion_as_a_mesh_is_told_by_which_option_it_is_given(tmp_path, capsys):
+    """A ball of 8 mm about (20, -3, 41) mm: as a file of its own, and inside the organ's file."""
+    organ = trimesh.Trimesh(lumpy(4).vertices_mm, lumpy(4).faces, process=False)
+    tumour = trimesh.creation.icosphere(subdivisions=3, radius=4.0)
+    tumour.apply_translation([20.0, -3.0, 41.0])
+    organ.export(tmp_path / "organ.stl")
+    tumour.export(tmp_path / "tumour.stl")
+    target = tmp_path / "scene"
+    assert new(target, tmp_path / "organ.stl", f"{tmp_path / 'tumour.stl'}:lesion") == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    place = [float(x) for x in re.search(r"--lesion (\S+) (\S+) (\S+) \(", said).groups()]
+    np.testing.assert_allclose(place, [20.0, -3.0, 41.0], atol=1e-3)
+    assert "which is 8 across" in said
+    assert not target.exists()
+    inside = tumour.copy()
+    inside.apply_translation(-inside.centroid)
+    trimesh.util.concatenate(organ, inside).export(tmp_path / "both.stl")
+    notes = prepare(Request((tmp_path / "both.stl",), ("organ",))).notes
+    assert any("inner bodies removed: 1 (where one was a lesion, place it by --lesion" in note
+               for note in notes)  # fmt: skip
+
+
+def test_a_dicom_image_is_told_to_be_segmented(tmp_path, capsys):
+    (tmp_path / "ct.DCM").write_bytes(b"\0" * 128 + b"DICM")
+    assert new(tmp_path / "scene", tmp_path / "ct.DCM") == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert "ct.DCM: a DICOM image is not read" in said
+    assert "segment it" in said
+    assert "NIfTI (.nii.gz) or NRRD (.nrrd)" in said
+
+
 def test_an_arm_model_that_is_not_there_names_file_and_field(made, tmp_path, capsys):
     mounts = list(open_scene(made[1]).spec.mounts)
     mounts[1] = dataclasses.replace(mounts[1], arm="nosuch")

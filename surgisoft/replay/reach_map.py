@@ -12,8 +12,11 @@ from surgisoft.scene.check import REASONS, Patch, SceneCheck, sentence
 from surgisoft.scene.folder import Scene
 from surgisoft.scene.mounted_arm import RingSolution, ring_moments
 
-REASON_COLOURS = ("#2a9d4a", "#5b6472", "#b5651d", "#7b2d8b", "#c1121f", "#1d5fa8")
-"""Colour of each reason, in the order of REASONS."""
+REASON_COLOURS = ("#2a9d4a", "#00a5b5", "#e08a1e", "#a02bb8", "#c1121f", "#1d5fa8")
+"""Colour of each reason, in the order of REASONS; the incidence is drawn in shades of grey."""
+
+HEADING_PAD_IN = 0.1
+"""Space above and below each part of the picture (inches): the heading stays off the titles."""
 
 
 def check_map(scene: Scene, path: Path) -> None:
@@ -52,6 +55,7 @@ def draw_reach_map(
         clearance_mm = np.empty_like(work.clearance_mm)
         clearance_mm[order] = work.clearance_mm
         _draw_ring(axes, scene, work.reasons[name], work.cuts[name], clearance_mm, whose)
+    figure.get_layout_engine().set(h_pad=HEADING_PAD_IN)
     figure.suptitle(f"{scene.spec.name}: {sentence(verdict)}", fontsize=9, wrap=True)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
@@ -67,15 +71,24 @@ def _draw_patch(figure, axes, scene: Scene, reason: np.ndarray, patch: Patch, wh
         triangles,
         np.degrees(patch.incidence_rad),
         shading="gouraud",
-        cmap="viridis_r",
+        cmap="Greys",
         vmin=0.0,
         vmax=worst,
     )
     figure.colorbar(shown, ax=axes, label="incidence of the beam (degrees)", shrink=0.85)
     for code in np.unique(patch.reason[patch.reason > 0]):
         bad = patch.flat_mm[patch.reason == code]
-        axes.scatter(*bad.T, s=26, marker="s", color=REASON_COLOURS[code], label=REASONS[code])
+        axes.scatter(
+            *bad.T,
+            s=26,
+            marker="s",
+            color=REASON_COLOURS[code],
+            edgecolors="white",
+            linewidths=0.6,
+            label=REASONS[code],
+        )
     closed = np.vstack((patch.ring_flat_mm, patch.ring_flat_mm[:1]))
+    axes.plot(*closed.T, color="black", lw=5.0)
     axes.plot(*closed.T, color="white", lw=3.5)
     for code in np.unique(reason):
         here = reason == code
@@ -86,8 +99,9 @@ def _draw_patch(figure, axes, scene: Scene, reason: np.ndarray, patch: Patch, wh
             label=f"ring: {REASONS[code]} ({100 * here.mean():.0f} %)",
             zorder=3,
         )
-    axes.set(aspect="equal", xlabel="mm", ylabel="mm", title=f"surface around the lesion{whose}")
-    axes.legend(fontsize=7, loc="upper right", framealpha=0.9)
+    axes.set(aspect="equal", xlabel="mm", ylabel="mm")
+    axes.set_title(f"surface around the lesion{whose}", fontsize=9)
+    axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.11), ncols=3, frameon=False)
 
 
 def _draw_ring(

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
 
 from surgisoft.cli import run
 from surgisoft.errors import InputError
-from surgisoft.scene import mounts
+from surgisoft.replay.reach_map import REASON_COLOURS, draw_reach_map
+from surgisoft.scene import frames, mounts
 from surgisoft.scene.author import (
     UP,
     Request,
@@ -444,6 +446,30 @@ def test_the_patch_agrees_with_the_ring(made):
     assert on_ring.sum() == 48
     assert np.all(patch.reason[on_ring] == 0)
     assert far.max() == pytest.approx(16.0, abs=0.2)
+
+
+def test_only_the_reasons_of_a_map_are_coloured(made, tmp_path):
+    """A point of each reason on the outermost circle: the incidence below is drawn in grey."""
+    scene = open_scene(made[1])
+    reaches = reaches_of(scene)
+    whole, verdict = reach_patch(scene, reaches), check_scene(scene, reaches)
+    codes = np.zeros(len(whole.reason), dtype=int)
+    outer = np.flatnonzero(np.isclose(np.linalg.norm(whole.flat_mm, axis=1), np.linalg.norm(whole.flat_mm, axis=1).max(),
+                                      rtol=0.1))  # fmt: skip
+    codes[outer[: 8 * 5]] = np.repeat([1, 2, 3, 4, 5], 8)
+    patch = dataclasses.replace(whole, reason=codes)
+    draw_reach_map(scene, verdict, {"laser": patch}, tmp_path / "map.png")
+    picture = np.asarray(Image.open(tmp_path / "map.png").convert("RGB")).astype(int)
+    left = picture[:, : int(0.52 * picture.shape[1])].reshape(-1, 3)
+    coloured = left[np.ptp(left, axis=1) > 60]
+    named = np.array([[int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in REASON_COLOURS])
+    for colour in named:
+        assert (coloured == colour).all(axis=1).sum() > 40
+    # a pixel at a marker's edge is a mixture of its colour with white, grey or black
+    hues = coloured - coloured.min(axis=1, keepdims=True)
+    own = named - named.min(axis=1, keepdims=True)
+    cosine = (hues @ own.T) / np.outer(frames.norm(hues), frames.norm(own))
+    assert np.mean(cosine.max(axis=1) > 0.97) > 0.95
 
 
 def test_a_map_is_drawn(made, tmp_path):

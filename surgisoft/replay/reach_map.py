@@ -35,12 +35,14 @@ def draw_reach_map(
     """Write a .png: each laser's patch coloured by the beam's incidence, and values on the ring."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     path, work = Path(path), verdict.work
     check_map(scene, path)
     if work is None:
         raise InputError("the ring does not lie on the organ, so there is no map to draw")
-    figure = Figure(figsize=(12.0, 5.6 * len(patches)), layout="constrained")
+    layout = ConstrainedLayoutEngine(h_pad=HEADING_PAD_IN)
+    figure = Figure(figsize=(12.0, 5.6 * len(patches)), layout=layout)
     FigureCanvasAgg(figure)
     grid = figure.subplots(len(patches), 2, width_ratios=(1.0, 1.15), squeeze=False)
     for number, ((name, patch), (left, right)) in enumerate(
@@ -55,7 +57,6 @@ def draw_reach_map(
         clearance_mm = np.empty_like(work.clearance_mm)
         clearance_mm[order] = work.clearance_mm
         _draw_ring(axes, scene, work.reasons[name], work.cuts[name], clearance_mm, whose)
-    figure.get_layout_engine().set(h_pad=HEADING_PAD_IN)
     figure.suptitle(f"{scene.spec.name}: {sentence(verdict)}", fontsize=9, wrap=True)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)

@@ -140,6 +140,21 @@ def test_burnt_areas_are_told_by_their_zones(task):
     assert (found["inside_mm2"].item(), found["healthy_mm2"].item()) == (1.0, 3.0)
 
 
+def test_the_reference_of_two_lines_is_dark_between_them(task):
+    """Two lines of 3 mm, 0.4 mm a step: dark in the steps that lead to the first point of one."""
+    first, second = (stretch.count for stretch in task.scene.stretches)
+    steps = first + second
+    assert task.pass_steps == steps
+    points, normals, on = task.reference(2 * steps)
+    assert points.shape == normals.shape == (2 * steps + 1, 3)
+    dark = [k for k in range(1, 2 * steps + 1) if not on[k]]
+    assert dark == [first, steps, steps + first, 2 * steps]
+    leaps = (points[1:] - points[:-1]).norm(dim=1)
+    assert leaps[on[1:]].max() < 0.45
+    assert leaps[~on[1:]].min() > 20.0
+    torch.testing.assert_close(points[:steps], points[steps : 2 * steps])
+
+
 def test_what_does_not_fit_is_one_line():
     with pytest.raises(InputError, match="take 2 s at 4 mm/s, and time_s is 1 s"):
         ContourAblation(ContourAblationConfig(contours=LINES, speed_mm_s=4.0, time_s=1.0))

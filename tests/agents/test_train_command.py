@@ -133,7 +133,7 @@ def test_a_logger_that_cannot_be_opened_leaves_nothing(tmp_path, capsys, monkeyp
     assert not folder.exists()
 
 
-def test_a_beam_beyond_the_limits_of_its_scene_is_warned_of_before_the_training(
+def test_a_beam_beyond_limits_or_too_weak_is_warned_of_before_the_training(
     tmp_path, capsys, monkeypatch
 ):
     """The training ends with its logger; what is said first is what counts here."""
@@ -148,6 +148,12 @@ def test_a_beam_beyond_the_limits_of_its_scene_is_warned_of_before_the_training(
         assert surgisoft(["train", *given, "--scene", str(scene), *run]) == 2
         said = capsys.readouterr().err
         assert ("mm long at the ring (standoff_mm: 36 to 60)" in said) == warned, said
+    file.write_text(file.read_text().replace("power_w = 20.0", "power_w = 0.5"))
+    assert surgisoft(["train", *given, "--scene", str(strict), *run]) == 2
+    said = capsys.readouterr().err
+    assert (
+        "the beam of 0.5 W, exactly on its reference for 60 s (1.3 passes), gives at most" in said
+    )
 
 
 def test_hyper_parameters_count_together_with_the_episodes():

@@ -15,6 +15,7 @@ from surgisoft.scene.camera import view
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.contours import SurfacePath, contour_path, outline_crossing_mm
+from surgisoft.scene.dose_patch import check_apart
 from surgisoft.scene.folder import Scene
 from surgisoft.scene.lesion import (
     ON_SURFACE_MM,
@@ -191,6 +192,12 @@ def _contour_paths(scene: Scene) -> tuple[list[SurfacePath], list[Finding]]:
         value = f"{path.length_mm:.1f} mm long"
         rows.append(Finding(f"{what} on the surface", value, wanted, True))
         paths.append(path)
+    try:
+        check_apart(paths)
+    except InputError as error:
+        rows.append(
+            Finding("contours apart", str(error).partition(";")[0], "crossings only", False)
+        )
     return paths, rows
 
 

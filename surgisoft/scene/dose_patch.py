@@ -34,6 +34,8 @@ MOST_SAMPLES = 400_000
 
 COINCIDE_MM = 0.05
 """Two paths nearer to each other than this coincide (mm)."""
+MOST_SHARED_MM = 2.0
+"""Length over which two paths may coincide: that of a crossing (mm)."""
 MARGIN_MM = 4.0
 """How far a patch reaches beyond the ring, the path, or the margin that is spared (mm). Tissue that
 is ablated farther out is no part of any area."""
@@ -174,7 +176,7 @@ def path_patch(
     else up to margin_mm from the paths. With band_mm 0 there is no ring; see `area_patch` for one
     outside of the outline only. Each path has stations of about station_mm, one path after another.
     """
-    _check_apart(paths, band_mm)
+    check_apart(paths)
     samples = _path_samples(mesh, paths, spacing_mm, margin_mm)
     zone = np.where(np.abs(samples.offset) <= 0.5 * band_mm, RING, samples.side)
     patch = samples.patch(mesh, zone, spacing_mm, station_mm)
@@ -186,8 +188,8 @@ def path_patch(
     return patch
 
 
-def _check_apart(paths: Sequence[SurfacePath], most_mm: float) -> None:
-    """Raise an InputError for two paths that coincide over a length of more than most_mm."""
+def check_apart(paths: Sequence[SurfacePath]) -> None:
+    """Raise an InputError for two paths that coincide over more than MOST_SHARED_MM."""
     from scipy.spatial import cKDTree
 
     for i, one in enumerate(paths):
@@ -195,7 +197,7 @@ def _check_apart(paths: Sequence[SurfacePath], most_mm: float) -> None:
             line = np.vstack((other.points_mm, other.points_mm[: int(other.closed)]))
             away, _ = cKDTree(resampled(line, COINCIDE_MM)).query(one.points_mm)
             along = one.length_mm * float((away <= COINCIDE_MM).mean())
-            if along > most_mm:
+            if along > MOST_SHARED_MM:
                 raise InputError(
                     f"contours '{other.name}' and '{one.name}' coincide over {along:.3g} mm; "
                     "expected contours that at most cross: leave one out, or move it"

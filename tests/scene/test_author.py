@@ -358,13 +358,20 @@ def test_contours_are_checked_as_the_ring_is(made, tmp_path, capsys):
         told = re.search(rf"contour '{name}' to 'rod' +(\S+) mm", said)
         assert float(told[1]) == pytest.approx(expected, abs=0.3)
 
+    again = dataclasses.replace(contours[4], name="again")
     crossed = check_scene(
-        dataclasses.replace(scene, spec=dataclasses.replace(scene.spec, contours=contours[3:])),
+        dataclasses.replace(
+            scene, spec=dataclasses.replace(scene.spec, contours=(*contours[3:], again))
+        ),
         reaches_of(scene),
     )
     assert not finding(crossed, "contour 'eight' on the surface").good
     assert "crosses itself" in finding(crossed, "contour 'eight' on the surface").value
     assert finding(crossed, "contour 'open_eight' on the surface").good
+    twice = finding(crossed, "contours apart")
+    length = finding(crossed, "contour 'open_eight' on the surface").value.split(" ")[0]
+    assert not twice.good
+    assert twice.value == f"contours 'open_eight' and 'again' coincide over {length} mm"
     assert finding(crossed, "contour 'open_eight' in the laser's reach").value == "100 %"
 
 

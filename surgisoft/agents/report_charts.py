@@ -298,7 +298,8 @@ def sweep_chart(field: str, label: str, lines: Mapping[str, Sequence[tuple]]) ->
             zip(lines.items(), colours * len(lines), strict=False)
         ):
             x, mean, low, high = np.array(points, dtype=float).T
-            most, known = max(most, np.nanmax(np.append(high, mean))), known | set(x.tolist())
+            most = max(most, np.nanmax(np.append(high, mean), initial=0.0))
+            known |= set(x.tolist())
             if apart:
                 beside = x + BESIDE * (k - 0.5 * (len(lines) - 1))
                 spread = np.abs(np.stack((low, high)) - mean)

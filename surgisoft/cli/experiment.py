@@ -22,7 +22,7 @@ from surgisoft.cli.options import (
 )
 from surgisoft.cli.progress import progress
 from surgisoft.command_line import typed
-from surgisoft.errors import counted
+from surgisoft.errors import InputError, counted
 
 if TYPE_CHECKING:
     from surgisoft.experiments.spec import Limits
@@ -69,9 +69,14 @@ def run(
     credibility: Credibility = None,
     effect_files: EffectFiles = None,
 ) -> None:
-    """Run an experiment; write tables, logs, pictures, replays and one HTML report."""
+    """Run an experiment; write tables, logs, pictures, replays and one HTML report.
+
+    A setting whose code raises an exception is left out of the report, and the command ends with
+    exit code 2.
+    """
     from surgisoft.agents.on_rig import rigs_in
     from surgisoft.experiments.page import markdown
+    from surgisoft.experiments.run import failed_words
     from surgisoft.experiments.session import finish_experiment, start_experiment
     from surgisoft.workers import check_processes
 
@@ -124,6 +129,8 @@ def run(
     if context is not None:
         print(f"credibility: {assessed.sentence}")
     show_written(files)
+    if results.failed:
+        raise InputError(failed_words(results.failed))
 
 
 @commands.command("check")

@@ -8,6 +8,7 @@ from pathlib import Path
 from surgisoft.agents.evaluate import cell
 from surgisoft.agents.report import episode_parts
 from surgisoft.agents.report_charts import path_chart, spread_chart, sweep_chart
+from surgisoft.errors import counted
 from surgisoft.experiments.results import Results, SettingResult
 from surgisoft.report import Facts, Gallery, Page, Picture, Section, Share, Table, Text
 from surgisoft.tasks.supervision import Row
@@ -24,7 +25,7 @@ HOW = (
 def experiment_page(results: Results, films: dict[tuple[str, int], Picture], about: str) -> Page:
     """HTML report of an experiment; films: (setting's label, episode) -> film strip to show."""
     how = results.experiment.of.experiment.how
-    sections = [_table(results), _outcomes(results)]
+    sections = [*_failed(results), _table(results), _outcomes(results)]
     if len(results.settings) > 1 or results.experiment.repeats > 1:
         sections.append(Section("Every episode", [Gallery(_spreads(results))]))
     sections += _sweeps(results)
@@ -90,7 +91,17 @@ def verdict(results: Results) -> str:
     safe = f"was on for at most {unsafe:.2g} s" if unsafe else "was never on"
     safe = "" if faults or not _beams(results) else f" The beam {safe} while it was unsafe."
     last = f" {last}" if "collided" in results.rows[0] else ""
-    return f"{first}.{last}{safe}"
+    without = len({failure.setting for failure in results.failed})
+    every = counted(len(settings) + without, "setting")
+    lost = f" Failed and left out: {without} of {every}." if without else ""
+    return f"{first}.{last}{safe}{lost}"
+
+
+def _failed(results: Results) -> list[Section]:
+    """What ended the blocks that failed, where some did."""
+    rows = [(failure.text, failure.file.name) for failure in results.failed]
+    table = Table(["what happened", "traceback, in the folder failures"], rows)
+    return [Section("Failed", [table])] if rows else []
 
 
 def _fault_came(results: Results, row: Row) -> bool:
@@ -114,7 +125,7 @@ def _one(setting: SettingResult) -> str:
 
 
 def _tone(results: Results) -> str:
-    if any(row.get("collided", 0.0) > 0.0 for row in results.rows):
+    if results.failed or any(row.get("collided", 0.0) > 0.0 for row in results.rows):
         return "bad"
     if results.experiment.faults:
         return "good" if max(row["beam_unsafe_longest_s"] for row in results.rows) < 0.15 else "bad"

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from surgisoft.agents.evaluate import Summary, summary
-from surgisoft.experiments.run import log_file
+from surgisoft.experiments.run import Failure, failures, log_file
 from surgisoft.experiments.spec import Experiment
 from surgisoft.files import write_atomically, write_json
 from surgisoft.tasks.episodes.file import load_episode
@@ -50,7 +50,9 @@ class Results:
     folder: Path
     """Folder of the results."""
     settings: list[SettingResult]
-    """Results of every setting, in order."""
+    """Results of every setting, in order, without those with a failure."""
+    failed: list[Failure] = field(default_factory=list)
+    """Blocks that an exception ended."""
 
     @property
     def rows(self) -> list[Row]:
@@ -84,7 +86,7 @@ def sum_up(spec: Experiment, folder: Path, rows: list[Row]) -> Results:
         found.append(
             SettingResult(label, episodes[0]["case"], values, episodes, overall, outcomes, worst)
         )
-    return Results(spec, folder, found)
+    return Results(spec, folder, found, failures(spec, folder))
 
 
 def write_tables(results: Results) -> list[Path]:
@@ -122,15 +124,14 @@ def write_tables(results: Results) -> list[Path]:
 
 
 def drop_logs(results: Results) -> None:
-    """Remove the logs of blocks' worst episodes that are not their setting's."""
-    kept = {
-        log_file(results.folder, setting.label, number)
-        for setting in results.settings
-        for number in (0, setting.worst)
-    }
-    for path in (results.folder / "logs").glob("*.npz"):
-        if path not in kept:
-            path.unlink()
+    """Remove the logs of blocks' worst episodes that are not their setting's.
+
+    A setting with a failure keeps its logs for the run that continues it.
+    """
+    for setting in results.settings:
+        for row in setting.rows:
+            if row["episode"] not in (0, setting.worst):
+                log_file(results.folder, setting.label, row["episode"]).unlink(missing_ok=True)
 
 
 def _numbers(values: list) -> np.ndarray:

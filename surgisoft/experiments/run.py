@@ -7,6 +7,7 @@ one go and one that was interrupted give the same rows.
 from __future__ import annotations
 
 import os
+import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import as_completed
@@ -26,7 +27,7 @@ from surgisoft.agents.policies import POLICIES
 from surgisoft.agents.rollout import EpisodeRecorders, Instant, Rollout, rollout
 from surgisoft.agents.run_folder import RunFolder, versions
 from surgisoft.config import LARGEST_INTEGER, Where
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, counted, raised_by
 from surgisoft.experiments.controllers import PhaseControllers
 from surgisoft.experiments.phases import REASONS, PhasedTask, with_phase_events
 from surgisoft.experiments.plan import (
@@ -45,7 +46,7 @@ from surgisoft.experiments.spec import (
     load_experiment,
     save_experiment,
 )
-from surgisoft.files import json_safe, new_folder, read_json, resolved, write_json
+from surgisoft.files import json_safe, new_folder, read_json, resolved, write_atomically, write_json
 from surgisoft.progress import Progress, silent
 from surgisoft.rig.registry import SIMULATED, check_rig, parse_rig
 from surgisoft.surrogate.checkpoint import content_hash
@@ -59,6 +60,9 @@ POLICY = "policy"
 """Name of a policy's digest among those of a case; those of arm models have the arms' names."""
 WITH = " with "
 """Between an arm's name and the values of the setting, in names of such digests."""
+LIBRARIES = {"surgisoft", "torch", "numpy", "scipy"}
+"""Folders whose lines are not named as those that raised an exception, where it went through code
+that lies elsewhere, such as that of the user's task."""
 DROPPED = ("phase", "reason", "reason_phase", "beam", "beam_unsafe", "safe")
 """Measures of single steps whose means mean nothing."""
 
@@ -71,6 +75,18 @@ class Block:
     """Results of each episode, see `Results`."""
     logs: dict[int, EpisodeLog]
     """Episode's number -> log: number 0, and the worst of the block."""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A block of episodes that an exception ended."""
+
+    setting: str
+    """The setting's label."""
+    text: str
+    """Setting, episodes, the exception, and the line that raised it, in one line."""
+    file: Path
+    """File with the text and the exception's traceback."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +118,11 @@ def row_file(folder: Path, setting: Setting, episode: int) -> Path:
 def log_file(folder: Path, setting: str, episode: int) -> Path:
     """Path of an episode's log, which exists for stored episodes only."""
     return folder / "logs" / f"{setting}-{episode:04d}.npz"
+
+
+def failure_file(folder: Path, setting: Setting, first: int) -> Path:
+    """Path of what ended a block; the file exists for blocks that failed only."""
+    return folder / "failures" / f"{setting.label}-{first:04d}.txt"
 
 
 def open_results(
@@ -296,8 +317,7 @@ def check_benches(spec: Experiment, folder: Path | None = None) -> None:
         if asked in seen:
             continue
         seen.add(asked)
-        texts = rigs_by_arm(case.rigs, spec.of.agents).values()
-        if all(parse_rig(text).name in SIMULATED for text in texts):
+        if not _may_be_real(spec, case):
             continue
         for bench in real_benches(build_task(spec, job.setting)).values():
             bench.close()
@@ -312,6 +332,10 @@ def run_experiment(
     on_warning: Callable[[str], None] = warnings.warn,
 ) -> list[Row]:
     """Run every block that has no results yet; returns all rows, in order. See `open_results`.
+
+    A block that an exception ends leaves its file of `failures`, and the others are run. The rows
+    are then those of the settings without a failure. Raises InputError where each setting has one,
+    and at once where a case is on a rig that may be real.
 
     cluster: address of a Dask scheduler whose workers, which see the same folder, run the blocks.
     on_warning: gets each warning of a block once, whichever process ran the block.
@@ -346,7 +370,31 @@ def run_experiment(
             warn(found)
             done += job.count
             report(done, total, job.setting.words)
-    return read_rows(folder, every)
+    failed = failures(spec, folder)
+    without = {failure.setting for failure in failed}
+    whole = [job for job in every if job.setting.label not in without]
+    if not whole:
+        raise InputError(f"every setting failed: {failed_words(failed)}")
+    return read_rows(folder, whole)
+
+
+def failures(spec: Experiment, folder: Path) -> list[Failure]:
+    """The blocks of an experiment that have no results because an exception ended them."""
+    found = []
+    for job in jobs(spec):
+        file = failure_file(folder, job.setting, job.first)
+        if file.is_file() and not _is_done(folder, job):
+            first_line = file.read_text(encoding="utf-8").partition("\n")[0]
+            found.append(Failure(job.setting.label, first_line, file))
+    return found
+
+
+def failed_words(failed: list[Failure]) -> str:
+    """The first failure, how many more there are, and what to do, in one line."""
+    more = f" (and {counted(len(failed) - 1, 'further block')})" if len(failed) > 1 else ""
+    return (
+        f"{failed[0].text}{more}; the traceback is in {failed[0].file}; continue with --resume"
+    )
 
 
 def read_rows(folder: Path, every: list[Job]) -> list[Row]:
@@ -400,10 +448,20 @@ def _is_done(folder: Path, job: Job) -> bool:
 def _run_block(spec: Experiment, folder: Path, job: Job, progress: Progress = silent) -> list[str]:
     """Run a block; its logs are written first, then each episode's row, whole or not at all.
 
-    Returns what it warned the user of.
+    An exception in simulation is written, see `Failure`. Returns what it warned the user of.
     """
+    failed = failure_file(folder, job.setting, job.first)
     with warnings.catch_warnings(record=True) as found:
-        block = roll_out_block(spec, job.setting, job.first, job.count, progress)
+        try:
+            block = roll_out_block(spec, job.setting, job.first, job.count, progress)
+        except Exception as error:
+            if _may_be_real(spec, job.setting.case):
+                raise
+            failed.parent.mkdir(exist_ok=True)
+            text = f"{_failed(job, error)}\n\n{traceback.format_exc()}"
+            write_atomically(failed, text.encode())
+            return []
+    failed.unlink(missing_ok=True)
     for number, log in block.logs.items():
         save_episode(log, log_file(folder, job.setting.label, number))
     for row in block.rows:
@@ -412,6 +470,26 @@ def _run_block(spec: Experiment, folder: Path, job: Job, progress: Progress = si
         if one.category is not UserWarning:
             warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
     return [str(one.message) for one in found if one.category is UserWarning]
+
+
+def _failed(job: Job, error: Exception) -> str:
+    """Setting, episodes and exception of a block that failed, in one line."""
+    last = job.first + job.count - 1
+    episodes = f"episode {job.first}" if job.count == 1 else f"episodes {job.first} to {last}"
+    name = f"setting '{job.setting.label}', {episodes}"
+    if isinstance(error, InputError):
+        return f"{name}: {error}"
+    frames = [frame.filename for frame in traceback.extract_tb(error.__traceback__)]
+    foreign = [file for file in frames if not LIBRARIES.intersection(Path(file).parts)]
+    return str(raised_by(name, error, "code", foreign[-1] if foreign else ""))
+
+
+def _may_be_real(spec: Experiment, case: Case) -> bool:
+    """Whether a rig of a case may be a real one."""
+    if case.plant != "rig":
+        return False
+    texts = rigs_by_arm(case.rigs, spec.of.agents).values()
+    return not all(parse_rig(text).name in SIMULATED for text in texts)
 
 
 def _run_missing(spec: Experiment, folder: Path, job: Job) -> list[str]:

@@ -89,6 +89,57 @@ def test_tables_hold_every_episode(whole):
     assert load_experiment(folder / "experiment.toml").repeats == 3
 
 
+THREE_TIMES = """
+[[vary]]
+field = "task.cut_s"
+values = [30.0, 40.0, 50.0]
+"""
+
+
+def test_a_setting_whose_code_raises_leaves_the_others_their_report(tmp_path, monkeypatch, capsys):
+    text = TINY.replace("repeats = 3", "repeats = 2").replace("together = 1", "together = 2")
+    file, folder = write(tmp_path, text + THREE_TIMES), tmp_path / "r"
+    play, broken = experiment_run.roll_out_block, ["simulation_cut_s=40"]
+
+    def played(spec, setting, *given):
+        if setting.label in broken:
+            raise ArithmeticError("a singular matrix")
+        return play(spec, setting, *given)
+
+    monkeypatch.setattr(experiment_run, "roll_out_block", played)
+    command = ["experiment", "run", str(file), "-o", str(folder), "--no-replays"]
+    assert run(command) == 2
+    printed = capsys.readouterr()
+    line = printed.err.strip().splitlines()[-1]
+    assert "setting 'simulation_cut_s=40', episodes 0 to 1: raised ArithmeticError in" in line
+    assert "test_run.py line" in line and "a singular matrix" in line and "--resume" in line
+    assert "Failed and left out: 1 of 3 settings." in printed.out
+    settings_ = json.loads((folder / "summary.json").read_text())["settings"]
+    assert list(settings_) == ["simulation_cut_s=30", "simulation_cut_s=50"]
+    assert "a singular matrix" in (folder / "report.html").read_text()
+    stored = (folder / "failures" / "simulation_cut_s=40-0000.txt").read_text()
+    assert "Traceback" in stored and 'raise ArithmeticError("a singular matrix")' in stored
+    broken.clear()
+    assert run([*command, "--resume"]) == 0
+    assert len(json.loads((folder / "summary.json").read_text())["settings"]) == 3
+    assert not list((folder / "failures").iterdir())
+
+
+def test_an_experiment_of_which_every_setting_fails_says_so_in_one_line(
+    tmp_path, monkeypatch, capsys
+):
+    def raises(*given):
+        raise InputError("model: raised ValueError; correct the model")
+
+    monkeypatch.setattr(experiment_run, "roll_out_block", raises)
+    file = write(tmp_path)
+    assert run(["experiment", "run", str(file), "-o", str(tmp_path / "r")]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "every setting failed: setting 'simulation', episode 0: model: raised ValueError" in line
+    assert "2 further blocks" in line
+    assert not (tmp_path / "r" / "report.html").exists()
+
+
 def test_an_interrupted_run_goes_on_where_it_stopped(whole, tmp_path):
     file, folder = whole
     spec, began = load_experiment(file), []

@@ -21,6 +21,10 @@ CELL_MM = 0.25
 """Size of a cell of the unrolled dose along the ring, and half of it across (mm)."""
 MAP_CELL_MM = 0.25
 """Least size of a cell of the dose map (mm); coarser where the samples are."""
+MOST_TICKS = 6
+"""Most intervals between the ticks of an axis whose labels stand side by side."""
+PLAIN_POWERS = (-3, 4)
+"""Powers of ten whose numbers are written out at an axis; others have a common factor."""
 LEAST_DOSE = 0.1
 """Doses below this share of the threshold are left blank."""
 
@@ -254,6 +258,8 @@ def spread_chart(
         every = np.concatenate([values for _, values in known])
         if "[" not in label and every.min() >= 0.0 and every.max() <= 1.0:  # a share
             axis.set_xlim(-0.02, 1.02)
+        axis.locator_params(axis="x", nbins=MOST_TICKS)
+        axis.ticklabel_format(axis="x", scilimits=PLAIN_POWERS, useOffset=False, useMathText=True)
         axis.set_xlabel(label)
         if title != label:
             axis.set_title(title)
@@ -310,6 +316,7 @@ def sweep_chart(field: str, label: str, lines: Mapping[str, Sequence[tuple]]) ->
         if apart:
             axis.set_xticks(sorted(known))
         axis.set_ylim(0.0, 1.06 * most if most > 0.0 else 1.0)
+        axis.ticklabel_format(axis="y", scilimits=PLAIN_POWERS, useOffset=False, useMathText=True)
         axis.set_xlabel(name)
         axis.set_ylabel(label)
         axis.set_title(f"{label} over {name}")

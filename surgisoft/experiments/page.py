@@ -64,7 +64,7 @@ def verdict(results: Results) -> str:
     settings, faults = results.settings, results.experiment.faults
     unsafe = max(row["beam_unsafe_longest_s"] for row in results.rows)
     hits = sum(row.get("collided", 0.0) > 0.0 for row in results.rows)
-    each = "; ".join(f"{s.label.replace('_', ' ')}: {_one(s)}" for s in settings)
+    each = "; ".join(f"'{s.label}': {_one(s)}" for s in settings)
     if faults and not any(_fault_came(results, row) for row in results.rows):
         first = f"No episode lasted until the fault at {min(f.at_s for f in faults):g} s"
         first += f"; {each}" if len(settings) <= SHOWN else ""
@@ -84,7 +84,7 @@ def verdict(results: Results) -> str:
         shares = [s.overall["success"].mean for s in settings]
         low, high = min(shares), max(shares)
         best, least = settings[shares.index(high)].label, settings[shares.index(low)].label
-        first = f"Success from {low:.0%} ({least}) to {high:.0%} ({best})"
+        first = f"Success from {low:.0%} ('{least}') to {high:.0%} ('{best}')"
         if low == high:
             first = f"Success {low:.0%} in each of {len(settings)} settings"
     last = f"{hits} of {len(results.rows)} episodes had contact."

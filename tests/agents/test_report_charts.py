@@ -1,5 +1,6 @@
 """Charts of an experiment: what lies between two values, and where an axis ends."""
 
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
@@ -74,3 +75,22 @@ def test_shares_are_drawn_from_0_to_1(monkeypatch):
     np.testing.assert_allclose(share.get_xlim(), (-0.02, 1.02))
     length, _ = drawn(monkeypatch, lambda: spread_chart("error", groups, "error [mm]"))
     assert length.get_xlim()[0] > 0.5
+
+
+def test_labels_of_small_numbers_stand_side_by_side(monkeypatch):
+    groups = [("sim", [1e-5, 1.7e-3]), ("rig", [3.5e-4])]
+    axis, _ = drawn(monkeypatch, lambda: spread_chart("error", groups, "beam error, mean [mm]"))
+    axis.figure.draw_without_rendering()
+    boxes = [label.get_window_extent() for label in axis.get_xticklabels() if label.get_text()]
+    assert len(boxes) >= 3
+    assert all(one.x1 < other.x0 for one, other in pairwise(boxes))
+
+
+def test_a_sweep_without_any_value_is_an_empty_chart(monkeypatch):
+    """As of the beam's error where the beam was never on; a warning fails the test."""
+    lines = {"sim": [(30.0, np.nan, np.nan, np.nan), (40.0, np.nan, np.nan, np.nan)]}
+    axis, _ = drawn(monkeypatch, lambda: sweep_chart("task.cut_s", "beam error", lines))
+    assert axis.get_ylim() == (0.0, 1.0)
+    lines["sim"][1] = (40.0, 2.0, 1.0, 3.0)
+    axis, _ = drawn(monkeypatch, lambda: sweep_chart("task.cut_s", "beam error", lines))
+    assert axis.get_ylim() == (0.0, pytest.approx(1.06 * 3.0))

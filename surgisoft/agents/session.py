@@ -193,13 +193,10 @@ class EvaluationRequest:
         if place is None or not (trained if given else trained[1:]):
             return
         name = Path(place).name if given else f"{_scene_of(trained[0])} of {trained[0].path}"
-        here = _geometry(open_scene(place))
+        here = open_scene(place)
         for run in trained:
-            if _geometry(open_scene(run.path / "scene")) != here:
-                on_warning(
-                    f"{run.path} was trained in another scene ({_scene_of(run)}) than {name}; its "
-                    "result here says nothing about the scene: train there"
-                )
+            if line := trained_elsewhere(run, here, name):
+                on_warning(line)
 
     def _warn_of_fields(self, runs: list[RunFolder], on_warning: Callable[[str], None]) -> None:
         """Warn of runs whose arm models, or fields of the configuration, are not those of the first
@@ -225,6 +222,19 @@ class EvaluationRequest:
                     f"{run.path} was trained with {', '.join(differ[:MOST_FIELDS])}{more}; it is "
                     f"evaluated in the configuration of {first.path}: evaluate it alone for its own"
                 )
+
+
+def trained_elsewhere(run: RunFolder, scene: Scene, name: str) -> str:
+    """One line where a run was trained in another scene than this one, else an empty text.
+
+    Bodies, lesion, mounts and tools are compared. name: what the line calls the scene.
+    """
+    if not run.config["scene"] or _geometry(open_scene(run.path / "scene")) == _geometry(scene):
+        return ""
+    return (
+        f"{run.path} was trained in another scene ({_scene_of(run)}) than {name}; its result here "
+        "says nothing about the scene: train there"
+    )
 
 
 def _scene_of(run: RunFolder) -> str:

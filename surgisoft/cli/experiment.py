@@ -140,14 +140,14 @@ def check(
 ) -> None:
     """Check an experiment's file and list its phases and settings, without running it."""
     from surgisoft.experiments.plan import settings
-    from surgisoft.experiments.run import check_playable, short_trainings
+    from surgisoft.experiments.run import about_policies, check_playable
     from surgisoft.experiments.session import beams_beyond_limits, open_experiment, weak_lasers
 
     spec = open_experiment(file)
     found = settings(spec)
     with progress("experiment check") as report:
         clear_mm = check_playable(spec, progress=report)
-    for line in (*beams_beyond_limits(spec), *weak_lasers(spec), *short_trainings(spec)):
+    for line in (*beams_beyond_limits(spec), *weak_lasers(spec), *about_policies(spec)):
         warn(line)
     episodes = counted(len(found) * spec.repeats, "episode")
     print(

@@ -22,10 +22,19 @@ HOW = (
 )
 
 
-def experiment_page(results: Results, films: dict[tuple[str, int], Picture], about: str) -> Page:
-    """HTML report of an experiment; films: (setting's label, episode) -> film strip to show."""
+def experiment_page(
+    results: Results,
+    films: dict[tuple[str, int], Picture],
+    about: str,
+    notes: Sequence[str] = (),
+) -> Page:
+    """HTML report of an experiment; films: (setting's label, episode) -> film strip to show.
+
+    notes: what the user was warned of.
+    """
     how = results.experiment.of.experiment.how
-    sections = [*_failed(results), _table(results), _outcomes(results)]
+    warned = [Section("Warnings", _lines_of("warning", notes))] if notes else []
+    sections = [*_failed(results), *warned, _table(results), _outcomes(results)]
     if len(results.settings) > 1 or results.experiment.repeats > 1:
         sections.append(Section("Every episode", [Gallery(_spreads(results))]))
     sections += _sweeps(results)

@@ -26,6 +26,7 @@ from surgisoft.agents.on_rig import at_benches, real_benches, rigs_by_arm
 from surgisoft.agents.policies import POLICIES
 from surgisoft.agents.rollout import EpisodeRecorders, Instant, Rollout, rollout
 from surgisoft.agents.run_folder import RunFolder, versions
+from surgisoft.agents.session import trained_elsewhere
 from surgisoft.config import LARGEST_INTEGER, Where
 from surgisoft.errors import InputError, counted, raised_by
 from surgisoft.experiments.controllers import PhaseControllers
@@ -49,6 +50,7 @@ from surgisoft.experiments.spec import (
 from surgisoft.files import json_safe, new_folder, read_json, resolved, write_atomically, write_json
 from surgisoft.progress import Progress, silent
 from surgisoft.rig.registry import SIMULATED, check_rig, parse_rig
+from surgisoft.scene.folder import open_scene
 from surgisoft.surrogate.checkpoint import content_hash
 from surgisoft.surrogate.code import name_code, named_code
 from surgisoft.tasks.episodes.file import save_episode
@@ -264,14 +266,20 @@ def check_playable(
     return clear_mm
 
 
-def short_trainings(spec: Experiment) -> list[str]:
-    """One line for each policy that was trained in shorter episodes than those of the experiment:
-    what it does after the end of such an episode, it never learned."""
+def about_policies(spec: Experiment) -> list[str]:
+    """What a user has to know about the trained policies of an experiment, one line each.
+
+    A policy that was trained in another scene, and one that was trained in shorter episodes than
+    those of the experiment: what it does after the end of such an episode, it never learned.
+    """
     lines = []
     for policy in dict.fromkeys(case.policy for case in spec.cases):
         if policy in (*POLICIES, NOMINAL):
             continue
-        task = RunFolder(policy).task()
+        run = RunFolder(policy)
+        if spec.in_scene:
+            lines.append(trained_elsewhere(run, open_scene(spec.scene), Path(spec.scene).name))
+        task = run.task()
         trained_s = task.steps * task.world.config.dt_s
         if spec.limits.time_s > trained_s + 0.5 * task.world.config.dt_s:
             lines.append(
@@ -279,7 +287,7 @@ def short_trainings(spec: Experiment) -> list[str]:
                 f"last up to {spec.limits.time_s:g} s: from {trained_s:g} s on it observes the "
                 "end of its episode"
             )
-    return lines
+    return [line for line in lines if line]
 
 
 def _as_built(spec: Experiment, setting: Setting) -> Setting:

@@ -20,7 +20,7 @@ from surgisoft.experiments.phases import PhasedTask
 from surgisoft.experiments.pictures import film, write_pictures
 from surgisoft.experiments.plan import Setting, build_task, scene_of, settings
 from surgisoft.experiments.results import Results, drop_logs, sum_up, write_tables
-from surgisoft.experiments.run import DROPPED, open_results, run_experiment
+from surgisoft.experiments.run import DROPPED, about_policies, open_results, run_experiment
 from surgisoft.experiments.spec import SCRIPTED, Experiment, load_experiment
 from surgisoft.files import resolved, write_atomically
 from surgisoft.progress import Progress, silent
@@ -211,15 +211,21 @@ def finish_experiment(
     cluster: address of a Dask scheduler whose workers run the episodes. on_warning: gets each
     warning of the episodes once.
     """
-    for line in (*beams_beyond_limits(spec), *weak_lasers(spec)):
-        on_warning(line)
-    rows = run_experiment(spec, folder, processes, progress, cluster, on_warning)
+    notes: list[str] = []
+
+    def note(text: str) -> None:
+        notes.append(text)
+        on_warning(text)
+
+    for line in (*beams_beyond_limits(spec), *weak_lasers(spec), *about_policies(spec)):
+        note(line)
+    rows = run_experiment(spec, folder, processes, progress, cluster, note)
     results = sum_up(spec, folder, rows)
     files = write_tables(results)
     logs = {(label, n): results.log(label, n) for label, n in shown_episodes(results)}
     films = {place: film(log) for place, log in logs.items() if log.camera is not None}
     files += write_pictures(results, list(logs), films)
-    files.append(write_page(experiment_page(results, films, about), folder / "report.html"))
+    files.append(write_page(experiment_page(results, films, about, notes), folder / "report.html"))
     drop_logs(results)
     if replays:
         files += _write_replays(results, progress)

@@ -125,6 +125,28 @@ def test_time_stays_within_its_range_in_longer_experiments(tmp_path, capsys):
     assert "was trained in" not in capsys.readouterr().err
 
 
+def test_a_policy_of_another_scene_is_told_by_check_run_and_report(tmp_path, capsys):
+    """The packaged policy was trained on the phantom; the experiment's scene has a smaller ring."""
+    other = tmp_path / "other"
+    shutil.copytree(PHANTOM, other)
+    file = other / "scene.toml"
+    file.write_text(file.read_text().replace("diameter_mm = 20.0", "diameter_mm = 18.0", 1))
+    case = '[[cases]]\nname = "learned"\npolicy = "ring"\n'
+    brief = TINY.replace("repeats = 3", "repeats = 1").replace("time_s = 0.5", "time_s = 0.2")
+    line = "ring was trained in another scene (phantom_liver) than other; its result here says"
+    plain = write(tmp_path, brief + case)
+    elsewhere = tmp_path / "elsewhere.toml"
+    elsewhere.write_text(plain.read_text().replace(str(PHANTOM), str(other)))
+    assert run(["experiment", "check", str(plain)]) == 0
+    assert "another scene" not in capsys.readouterr().err
+    assert run(["experiment", "check", str(elsewhere)]) == 0
+    assert line in capsys.readouterr().err
+    results = tmp_path / "results"
+    assert run(["experiment", "run", str(elsewhere), "-o", str(results), "--no-replays"]) == 0
+    assert line in capsys.readouterr().err
+    assert line in (results / "report.html").read_text()
+
+
 def test_a_lesion_of_an_experiment_keeps_the_scenes_clearance(tmp_path):
     """In `multi_lesion` the ring `right` is 47.4 mm from the gallbladder, `left` 54.1 mm."""
     scene = tmp_path / "strict"

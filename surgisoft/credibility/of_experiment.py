@@ -9,6 +9,7 @@ from surgisoft.credibility.context import Context
 from surgisoft.credibility.scenario import outcomes
 from surgisoft.diagnosis.compare import compare
 from surgisoft.errors import InputError
+from surgisoft.experiments.plan import scene_folder
 from surgisoft.experiments.results import Results
 from surgisoft.experiments.spec import Experiment
 from surgisoft.measurement.recordings import load_recordings
@@ -49,14 +50,20 @@ def arm_of(spec: Experiment) -> str:
     """The arm model of an experiment: of its cases, its task, or the mounts of its scene."""
     stated = getattr(spec.task, "arm", None)
     default = {str(stated)} if stated else {"default"}
-    scene = Path(spec.scene)
-    if spec.in_scene and not stated:
-        default = {mount.arm for mount in open_scene(scene).spec.mounts}
-    arms = {name for case in spec.cases for name in ({case.arm} if case.arm else default)}
+
+    def of_scene(folder: str) -> set[str]:
+        names = {mount.arm for mount in open_scene(folder).spec.mounts}
+        return {str(at) if (at := Path(folder) / name).is_dir() else name for name in names}
+
+    arms: set[str] = set()
+    for case in spec.cases:
+        in_scene = spec.in_scene and not stated and not case.arm
+        own = {case.arm} if case.arm else default
+        arms |= of_scene(scene_folder(spec, case)) if in_scene else own
     if len(arms) > 1:
         raise InputError(
             f"the experiment has the arm models {', '.join(sorted(arms))}; expected model = NAME "
             "in the context, the one that its recordings were made on"
         )
     (arm,) = arms
-    return str(scene / arm) if (scene / arm).is_dir() else arm
+    return arm

@@ -294,6 +294,7 @@ def _design(results: Results) -> Section:
     cases = [
         f"{case.name}: {case.plant}, policy {Path(case.policy).name}"
         + (f", hidden {', '.join(case.hidden)}" if case.hidden else "")
+        + (f", scene {Path(case.scene).name}" if case.scene else "")
         for case in spec.cases
     ]
     return Section(

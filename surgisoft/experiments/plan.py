@@ -136,6 +136,10 @@ def _check_vary(spec: Experiment, vary: Vary, place: Where) -> None:
         bad = [v for v in vary.values if not isinstance(v, kind) or v < (name == "chamber")]
         if bad:
             raise (place / "values").error(f"got {bad[0]!r}", f"what a fault has as {name}")
+    elif top == "task" and name == "scene":
+        raise (place / "field").error(
+            f"got '{vary.field}'", "a case for each scene: [[cases]] with scene = 'FOLDER'"
+        )
     else:
         raise (place / "field").error(
             f"got '{vary.field}'",
@@ -199,9 +203,14 @@ def rig_config(setting: Setting, place: Where, arms: Sequence[str]) -> RigConfig
     )
 
 
+def scene_folder(spec: Experiment, case: Case) -> str:
+    """Folder of the scene of a case: its own, or that of the experiment."""
+    return case.scene or spec.scene
+
+
 def scene_of(spec: Experiment, setting: Setting) -> Scene:
     """The scene with the setting's lesion, in place of its own and of its contours."""
-    scene = open_scene(spec.scene)
+    scene = open_scene(scene_folder(spec, setting.case))
     if setting.lesion is None:
         return scene
     lesion = dataclasses.replace(
@@ -240,7 +249,7 @@ def build_task(
     if setting.case.arm:
         config = with_fields(config, arm=setting.case.arm)
     if spec.in_scene:
-        config = dataclasses.replace(config, scene=spec.scene)
+        config = dataclasses.replace(config, scene=scene_folder(spec, setting.case))
         opened = dataclasses.replace(config, scene=scene_of(spec, setting))
         base = spec.of.build(opened, "cpu")
         base.config = config

@@ -36,6 +36,7 @@ from surgisoft.experiments.plan import (
     Setting,
     build_task,
     rig_config,
+    scene_folder,
     scene_of,
     settings,
 )
@@ -60,6 +61,8 @@ from surgisoft.workers import CLUSTER, check_processes, torch_threads, workers
 
 POLICY = "policy"
 """Name of a policy's digest among those of a case; those of arm models have the arms' names."""
+SCENE = "scene"
+"""Name of the digest of a case's own scene among those of the case."""
 WITH = " with "
 """Between an arm's name and the values of the setting, in names of such digests."""
 LIBRARIES = {"surgisoft", "torch", "numpy", "scipy"}
@@ -171,8 +174,8 @@ def open_results(
     if not remote:
         check_benches(spec)
     about: dict[str, object] = {"versions": versions()}
-    if spec.in_scene:
-        about["scene_hash"] = scene_of(spec, settings(spec)[0]).content_hash
+    if shared := _shared_scene(spec):
+        about["scene_hash"] = shared
     about["cases"] = {case.name: _case_hashes(spec, case) for case in spec.cases}
     replaced = [path.name for path in folder.iterdir()] if folder.exists() else []
     with new_folder(folder, own=replaced) as fresh:  # old results stay until the new ones begin
@@ -188,7 +191,8 @@ def _check_began_with(spec: Experiment, folder: Path) -> None:
     about = read_json(file) if file.is_file() else None
     about = about if isinstance(about, dict) else {}
     began = about.get("scene_hash")
-    if spec.in_scene and began not in (None, scene_of(spec, settings(spec)[0]).content_hash):
+    shared = _shared_scene(spec)
+    if shared and began not in (None, shared):
         raise _changed(folder, f"its scene '{spec.scene}'", "scene")
     cases = about.get("cases")
     stated = cases if isinstance(cases, dict) else {}
@@ -201,9 +205,21 @@ def _check_began_with(spec: Experiment, folder: Path) -> None:
         for name in (name for name in before if name in now and now[name] != before[name]):
             arm, _, varied = name.partition(WITH)
             of_arm = f"the arm model of '{arm}'{WITH * bool(varied)}{varied}"
-            what = f"the policy '{case.policy}'" if name == POLICY else of_arm
-            kind = "policy" if name == POLICY else "model"
+            of_name = {
+                POLICY: (f"the policy '{case.policy}'", "policy"),
+                SCENE: (f"the scene '{case.scene}'", "scene"),
+            }
+            what, kind = of_name.get(name, (of_arm, "model"))
             raise _changed(folder, f"{what} of its case '{case.name}'", kind)
+
+
+def _shared_scene(spec: Experiment) -> str:
+    """Digest of the experiment's scene with its first lesion; empty where no case is in it."""
+    if spec.in_scene:
+        for setting in settings(spec):
+            if not setting.case.scene:
+                return scene_of(spec, setting).content_hash
+    return ""
 
 
 def _changed(folder: Path, what: str, kind: str) -> InputError:
@@ -216,7 +232,7 @@ def _changed(folder: Path, what: str, kind: str) -> InputError:
 
 def _case_hashes(spec: Experiment, case: Case) -> dict[str, str]:
     """Digests of what acts in a case: arm's name -> that of its model, `POLICY` -> that of the
-    checkpoint of a training run.
+    checkpoint of a training run, `SCENE` -> that of the case's own scene.
 
     Where a field with text varies, such as the arm, each further combination has names of its own:
     the arm's with `WITH`, the fields and their values.
@@ -228,10 +244,12 @@ def _case_hashes(spec: Experiment, case: Case) -> dict[str, str]:
             texts = tuple((f, value) for f, value in setting.values if isinstance(value, str))
             differ.setdefault(texts, setting)
     for texts, setting in differ.items():
-        plain = replace(setting, case=Case("", arm=case.arm))
+        plain = replace(setting, case=Case("", arm=case.arm, scene=case.scene))
         varied = WITH + ", ".join(f"{f} = '{value}'" for f, value in texts) if hashes else ""
         arms = build_task(spec, plain, on_warning=None).world.arms
         hashes |= {name + varied: content_hash(arm.model) for name, arm in arms.items()}
+    if case.scene:
+        hashes[SCENE] = scene_of(spec, next(iter(differ.values()))).content_hash
     if case.policy in (*POLICIES, NOMINAL):
         return hashes
     found = RunFolder(case.policy).policy_hash
@@ -273,13 +291,13 @@ def about_policies(spec: Experiment) -> list[str]:
     those of the experiment: what it does after the end of such an episode, it never learned.
     """
     lines = []
-    for policy in dict.fromkeys(case.policy for case in spec.cases):
-        if policy in (*POLICIES, NOMINAL):
-            continue
-        run = RunFolder(policy)
+    learned = [case for case in spec.cases if case.policy not in (*POLICIES, NOMINAL)]
+    for policy, folder in dict.fromkeys((c.policy, scene_folder(spec, c)) for c in learned):
         if spec.in_scene:
-            lines.append(trained_elsewhere(run, open_scene(spec.scene), Path(spec.scene).name))
-        task = run.task()
+            scene, name = open_scene(folder), Path(folder).name
+            lines.append(trained_elsewhere(RunFolder(policy), scene, name))
+    for policy in dict.fromkeys(case.policy for case in learned):
+        task = RunFolder(policy).task()
         trained_s = task.steps * task.world.config.dt_s
         if spec.limits.time_s > trained_s + 0.5 * task.world.config.dt_s:
             lines.append(
@@ -300,7 +318,7 @@ def _as_built(spec: Experiment, setting: Setting) -> Setting:
     for text in texts:
         check_rig(text)
     if not all(parse_rig(text).name in SIMULATED for text in texts):
-        case = Case("", policy=case.policy, arm=case.arm)
+        case = Case("", policy=case.policy, arm=case.arm, scene=case.scene)
     left_out = (*ROBOT_SEED, "fault.at_s")
     values = tuple((field, value) for field, value in setting.values if field not in left_out)
     if case.plant != "rig":

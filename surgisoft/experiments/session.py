@@ -18,7 +18,7 @@ from surgisoft.experiments.controllers import PhaseControllers
 from surgisoft.experiments.page import experiment_page, markdown, shown_episodes
 from surgisoft.experiments.phases import PhasedTask
 from surgisoft.experiments.pictures import film, write_pictures
-from surgisoft.experiments.plan import Setting, build_task, scene_of, settings
+from surgisoft.experiments.plan import Setting, build_task, scene_folder, scene_of, settings
 from surgisoft.experiments.results import Results, drop_logs, sum_up, write_tables
 from surgisoft.experiments.run import DROPPED, about_policies, open_results, run_experiment
 from surgisoft.experiments.spec import SCRIPTED, Experiment, load_experiment
@@ -235,13 +235,18 @@ def finish_experiment(
 
 
 def beams_beyond_limits(spec: Experiment) -> list[str]:
-    """See `beam_beyond_limits`: one line for each lesion where a beam passes its scene's limits."""
+    """See `beam_beyond_limits`: one line for each lesion where a beam passes its scene's limits, in
+    each of the scenes."""
     if not spec.in_scene or getattr(spec.task, "arm", None) is not None:
         return []
     found = []
-    for setting in {setting.lesion: setting for setting in settings(spec)}.values():
+    places = {(scene_folder(spec, each.case), each.lesion): each for each in settings(spec)}
+    several = len({folder for folder, _ in places}) > 1
+    for (folder, lesion), setting in places.items():
         if beyond := beam_beyond_limits(scene_of(spec, setting)):
-            found.append(f"lesion '{setting.lesion.name}': {beyond}" if setting.lesion else beyond)
+            of_scene = f"scene '{Path(folder).name}': " if several else ""
+            of_lesion = f"lesion '{lesion.name}': " if lesion else ""
+            found.append(f"{of_scene}{of_lesion}{beyond}")
     return found
 
 

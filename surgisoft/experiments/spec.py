@@ -121,6 +121,8 @@ class Case:
     """On a real rig: whether it has to move as its arm model predicts before each setting."""
     arm: str = ""
     """Arm model of all arms: default or a folder; without it the scene's."""
+    scene: str = ""
+    """Folder of the case's scene, relative to the file; empty: the experiment's."""
 
 
 @dataclass(frozen=True)
@@ -315,6 +317,7 @@ def save_experiment(spec: Experiment, path: Path) -> None:
         for name in ("policy", "arm"):
             if case[name] not in ("", "default", SCRIPTED, NOMINAL):
                 case[name] = _from_folder(case[name], folder)
+        case["scene"] = _from_folder(case["scene"], folder) if case["scene"] else ""
     table["task"] = without_empty_tables(type(spec.task), table["task"])
     write_toml(path, without_empty_tables(Experiment, table))
 
@@ -361,12 +364,14 @@ def _absolute(spec: Experiment, where: Where) -> Experiment:
 
     def of_case(i: int, case: Case) -> Case:
         place = where / "cases" / i
-        policy, arm = case.policy, case.arm
+        policy, arm, scene = case.policy, case.arm, case.scene
         if policy not in (SCRIPTED, NOMINAL):
             policy = there(policy, place / "policy", "scripted, nominal, or a run's folder")
         if arm not in ("", "default"):
             arm = there(arm, place / "arm", "default, or an arm model's folder")
-        return dataclasses.replace(case, policy=policy, arm=arm)
+        if scene:
+            scene = there(scene, place / "scene", "a scene's folder")
+        return dataclasses.replace(case, policy=policy, arm=arm, scene=scene)
 
     def of_controller(i: int, own: ControllerSpec) -> ControllerSpec:
         if not own.schedule:
@@ -443,6 +448,10 @@ def _check_whole(spec: Experiment, where: Where) -> None:
             f"got '{spec.limits.retreat}'", f"one of the phases: {', '.join(known)}"
         )
     for i, case in enumerate(spec.cases):
+        if case.scene and not spec.in_scene:
+            raise (where / "cases" / i / "scene").error(
+                f"got '{case.scene}'", f"none: {spec.scenario} has no scene"
+            )
         given = [
             each
             for each in ("hidden", "robot_seed", "rigs", "preflight")

@@ -125,6 +125,18 @@ def test_time_stays_within_its_range_in_longer_experiments(tmp_path, capsys):
     assert "was trained in" not in capsys.readouterr().err
 
 
+def test_scenes_vary_by_cases(tmp_path):
+    vary = '[[vary]]\nfield = "task.scene"\nvalues = ["a", "b"]\n'
+    with pytest.raises(InputError, match=r"expected a case for each scene: \[\[cases\]\] with sce"):
+        settings(load_experiment(write(tmp_path, TINY + vary)))
+    case = '[[cases]]\nname = "a"\nscene = "nowhere"\n'
+    with pytest.raises(InputError, match="nowhere"):
+        load_experiment(write(tmp_path, TINY + case))
+    text = 'name = "t"\nscenario = "track_circle"\n[[phases]]\nname = "go"\ntimeout_s = 1.0\n'
+    with pytest.raises(InputError, match="expected none: track_circle has no scene"):
+        load_experiment(write(tmp_path, text + case))
+
+
 def test_a_policy_of_another_scene_is_told_by_check_run_and_report(tmp_path, capsys):
     """The packaged policy was trained on the phantom; the experiment's scene has a smaller ring."""
     other = tmp_path / "other"

@@ -160,6 +160,37 @@ def test_an_interrupted_run_goes_on_where_it_stopped(whole, tmp_path):
     assert _rows(tmp_path / "r") == _rows(folder)
 
 
+def test_cases_of_two_scenes_are_compared(tmp_path, capsys):
+    """The rings of the two scenes have radii of 10 and 9 mm; a scene that changes is refused."""
+    small = tmp_path / "small"
+    shutil.copytree(PHANTOM, small)
+    scene = small / "scene.toml"
+    scene.write_text(scene.read_text().replace("diameter_mm = 20.0", "diameter_mm = 18.0", 1))
+    cases = '[[cases]]\nname = "shipped"\n[[cases]]\nname = "less"\nscene = "small"\n'
+    brief = TINY.replace("repeats = 3", "repeats = 1").replace("time_s = 0.5", "time_s = 0.2")
+    file, folder = write(tmp_path, brief + cases), tmp_path / "r"
+    assert run(["experiment", "run", str(file), "-o", str(folder)]) == 0
+    spec = load_experiment(folder / "experiment.toml")
+    assert [case.scene for case in spec.cases] == ["", str(small)]
+    results = sum_up(spec, folder, run_experiment(spec, folder))
+    for label, radius_mm in (("shipped", 10.0), ("less", 9.0)):
+        path = results.log(label, 0).path_mm
+        away = np.linalg.norm(path - path.mean(0), axis=1)
+        np.testing.assert_allclose(away, radius_mm, atol=0.3)
+    assert "less: simulation, policy scripted, scene small" in (folder / "report.html").read_text()
+    hashes = json.loads((folder / "versions.json").read_text())
+    assert hashes["cases"]["less"]["scene"] != hashes["scene_hash"]
+    assert "scene" not in hashes["cases"]["shipped"]
+    scene.write_text(scene.read_text().replace("diameter_mm = 18.0", "diameter_mm = 17.0", 1))
+    for row in (folder / "rows").glob("less-*"):
+        row.unlink()
+    capsys.readouterr()
+    assert run(["experiment", "run", str(file), "-o", str(folder), "--resume"]) == 2
+    assert "small' of its case 'less' has changed since the results began" in (
+        capsys.readouterr().err
+    )
+
+
 def test_results_go_on_in_another_installation(tmp_path, monkeypatch):
     """What the package brings along is named, not placed; its content has to be the same."""
     case = '[[cases]]\nname = "ours"\npolicy = "ring"\n'

@@ -100,6 +100,11 @@ class Rules(Protocol):
         """Measures of single steps whose means mean nothing."""
         ...
 
+    @property
+    def left_out(self) -> Sequence[str]:
+        """What the experiment varies and an evaluation does not, one line each."""
+        ...
+
     def over(self, task: Task) -> Task:
         """The task, in simulation or on rigs, under the rules."""
         ...
@@ -352,6 +357,8 @@ def evaluate(
         raise wrong_type("policies", given, "the name of a policy, or several names")
     names = tuple(dict.fromkeys(str(name) for name in given))
     request = EvaluationRequest(names, task, **fields).under_rules()
+    for line in () if request.rules is None else request.rules.left_out:
+        on_warning(line)
     plain, config = request.resolved(on_warning)
     _warn_of_reach(plain, on_warning)
     if beyond := beam_beyond_limits_of(config):

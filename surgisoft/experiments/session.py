@@ -74,6 +74,7 @@ class ExperimentRules:
 
     Satisfies `surgisoft.agents.session.Rules`: `evaluate(policies, rules=ExperimentRules.of(name))`
     takes the experiment's task, scene and seed, so that its episode k is that of the experiment.
+    What the experiment varies keeps the value of its `[task]`, see `left_out`.
     """
 
     spec: Experiment
@@ -106,6 +107,36 @@ class ExperimentRules:
     def seed(self) -> int:
         """Seed of the experiment's episodes."""
         return self.spec.seed
+
+    @property
+    def left_out(self) -> list[str]:
+        """Fields that the experiment varies, its lesions and its cases' scenes: episodes under the
+        rules have one configuration, in which they are not."""
+        spec = self.spec
+        found = []
+        for vary in spec.vary:
+            plain = self._plain(vary.field)
+            here = f", here {plain}" if plain else ""
+            found.append(f"{vary.field} ({', '.join(map(str, vary.values))}{here})")
+        if spec.lesions:
+            found.append(f"the lesions {', '.join(each.name for each in spec.lesions)}")
+        scenes = dict.fromkeys(Path(case.scene).name for case in spec.cases if case.scene)
+        if scenes:
+            found.append(f"the scenes {', '.join(scenes)}")
+        if not found:
+            return []
+        return [
+            f"--rules {spec.name}: the experiment varies {'; '.join(found)}, which evaluate leaves "
+            "out; run them by 'surgisoft experiment run', a trained policy by its --policy"
+        ]
+
+    def _plain(self, field: str) -> str:
+        """Value of a task's field in the configuration of the rules, as text; else empty."""
+        top, *names = field.split(".")
+        found = self.spec.task
+        for name in names:
+            found = getattr(found, name, None)
+        return str(found) if top == "task" and found is not None else ""
 
     def over(self, task: Task) -> PhasedTask:
         """The task under the rules."""

@@ -341,6 +341,21 @@ def test_an_experiment_and_evaluate_by_its_rules_give_the_same_episodes(tmp_path
         np.testing.assert_array_equal(values, [expected], err_msg=name)
 
 
+def test_evaluate_tells_what_of_an_experiment_it_leaves_out(tmp_path, monkeypatch):
+    """The default of cut_s is 45 s, which is none of the experiment's values."""
+    empty = Evaluation("random", {}, {}, None)
+    monkeypatch.setattr(session, "rollout", lambda *_, **__: None)
+    monkeypatch.setattr(session, "summarised", lambda *_, **__: empty)
+    told = []
+    lesion = '[[lesions]]\nname = "left"\ncentre_mm = [0.0, 0.0, 0.0]\n'
+    for text in (TINY, TINY + THREE_TIMES + lesion):
+        spec = load_experiment(write(tmp_path, text))
+        session.evaluate("random", rules=ExperimentRules(spec), on_warning=told.append)
+    (line,) = told
+    assert "varies task.cut_s (30.0, 40.0, 50.0, here 45.0); the lesions left, which" in line
+    assert "surgisoft experiment run" in line
+
+
 def test_evaluate_states_the_rule_of_success(monkeypatch):
     empty = Evaluation("random", {}, {}, None)
     monkeypatch.setattr(session, "rollout", lambda *_, **__: None)

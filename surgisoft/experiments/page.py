@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from surgisoft.agents.evaluate import cell
 from surgisoft.agents.report import episode_parts
 from surgisoft.agents.report_charts import path_chart, spread_chart, sweep_chart
 from surgisoft.errors import counted
+from surgisoft.experiments.plan import configured
 from surgisoft.experiments.results import Results, SettingResult
+from surgisoft.experiments.spec import Experiment
 from surgisoft.report import Facts, Gallery, Page, Picture, Section, Share, Table, Text
 from surgisoft.tasks.supervision import Row
 
@@ -207,11 +210,35 @@ def rules(results: Results) -> str:
     spec = results.experiment
     if spec.of.success_rule is None:
         return "Success: nothing is aborted."
-    rule = spec.of.success_rule(spec.task)
-    varied = [vary.field.removeprefix("task.") for vary in spec.vary]
-    named = ", ".join(field for field in varied if f"({field})" in rule)
-    of_setting = f" ({named}: the setting's value)" if named else ""
-    return f"Success: {rule}{of_setting}; nothing is aborted."
+    return f"Success: {_rule_of_all(spec, spec.of.success_rule)}; nothing is aborted."
+
+
+def _rule_of_all(spec: Experiment, rule: Callable[[Any], str]) -> str:
+    """The rule of success with the values of all settings, such as "in 30 or 50 s (cut_s)"."""
+    words = rule(spec.task).split(" ")
+    unplaced = []
+    for vary in spec.vary:
+        field = vary.field.removeprefix("task.")
+        if not any(f"({field})" in word for word in words):
+            continue
+        of_values = [rule(configured(spec, ((vary.field, v),))).split(" ") for v in vary.values]
+        if any(len(each) != len(words) for each in of_values):
+            unplaced.append(field)
+            continue
+        plain = rule(spec.task).split(" ")
+        for place, column in enumerate(zip(*of_values, strict=True)):
+            if set(column) != {plain[place]}:
+                words[place] = _either(list(dict.fromkeys(column)))
+    of_setting = f" ({', '.join(unplaced)}: the setting's value)" if unplaced else ""
+    return " ".join(words) + of_setting
+
+
+def _either(values: list[str]) -> str:
+    """Values as "1, 2 or 3"; of many the first and the last."""
+    if len(values) > SHOWN:
+        return f"{values[0]} to {values[-1]}"
+    first = ", ".join(values[:-1])
+    return f"{first} or {values[-1]}" if first else values[-1]
 
 
 def _outcomes(results: Results) -> Section:

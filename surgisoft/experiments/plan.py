@@ -114,7 +114,7 @@ def _check_vary(spec: Experiment, vary: Vary, place: Where) -> None:
     if top == "task" and name and name != "scene":
         for i, value in enumerate(vary.values):
             try:
-                _configured(spec, ((vary.field, value),))
+                configured(spec, ((vary.field, value),))
             except InputError as error:
                 raise (place / "values" / i).error(
                     f"{error}", "a value that the task takes"
@@ -151,8 +151,8 @@ def _check_vary(spec: Experiment, vary: Vary, place: Where) -> None:
         )
 
 
-def _configured(spec: Experiment, values) -> Any:
-    """The task's configuration with what varies; the scene is still a folder's name."""
+def configured(spec: Experiment, values) -> Any:
+    """The task's configuration with pairs (field, value) of what varies; not yet in a scene."""
     table = to_table(spec.task)
     for field, value in values:
         top, _, name = field.partition(".")
@@ -245,7 +245,7 @@ def build_task(
 
     on_warning: is told of arm models that do not predict the rig, see `on_rig`.
     """
-    config = _configured(spec, setting.values)
+    config = configured(spec, setting.values)
     if setting.case.arm:
         config = with_fields(config, arm=setting.case.arm)
     if spec.in_scene:

@@ -406,13 +406,18 @@ def test_a_fault_that_never_came_is_said_to_have_not(tmp_path, capsys):
     assert "got 'succeeded'; expected one of at rest, never" in capsys.readouterr().err
 
 
-def test_the_rule_of_success_says_which_of_its_values_vary(tmp_path):
-    """The sentence has the value of the file, and each setting one of its own."""
-    plain = load_experiment(write(tmp_path, TINY))
-    assert "setting's value" not in rules(SimpleNamespace(experiment=plain))
+def test_the_rule_of_success_has_the_values_of_all_settings(tmp_path):
+    """Not the file's, or the default of 45 s, which is that of no setting."""
+
+    def said(text):
+        return rules(SimpleNamespace(experiment=load_experiment(write(tmp_path, text))))
+
+    assert "within 50 mm of its target (fire_mm), which goes once around in 45 s" in said(TINY)
     vary = '\n[[vary]]\nfield = "task.fire_mm"\nvalues = [0.5, 5.0]\n'
-    varied = load_experiment(write(tmp_path, TINY + vary))
-    assert "(fire_mm: the setting's value); " in rules(SimpleNamespace(experiment=varied))
+    both = said(TINY + vary + THREE_TIMES)
+    assert "within 0.5 or 5 mm of its target (fire_mm)" in both
+    assert "around in 30, 40 or 50 s (cut_s); nothing is aborted." in both
+    many = THREE_TIMES.replace("[30.0,", "[10.0, 20.0, 30.0,")
+    assert "around in 10 to 50 s (cut_s)" in said(TINY + many)
     other = vary.replace("task.fire_mm", "task.world.randomisation.mount_mm")
-    drawn = load_experiment(write(tmp_path, TINY + other))
-    assert "setting's value" not in rules(SimpleNamespace(experiment=drawn)), "not in the rule"
+    assert said(TINY + other) == said(TINY), "not in the rule"

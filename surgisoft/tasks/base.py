@@ -162,6 +162,10 @@ class LoneEpisode(Protocol):
         """See `Outcome`."""
 
     @property
+    def failed(self) -> bool:
+        """Whether an arm is no longer finite."""
+
+    @property
     def measures(self) -> dict[str, float]:
         """Quantities for people; nan where one does not apply."""
 

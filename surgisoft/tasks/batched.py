@@ -17,7 +17,7 @@ from torch import Tensor
 
 from surgisoft.errors import InputError
 from surgisoft.memory import keep_freed_memory
-from surgisoft.tasks.arguments import actions_of, whole
+from surgisoft.tasks.arguments import actions_of, check_agents, whole
 from surgisoft.tasks.base import Task, TaskState
 from surgisoft.tasks.graphed import donated_episodes
 from surgisoft.tasks.registry import make_with
@@ -43,6 +43,9 @@ class BatchedStep:
     """(B,) bool: the task ended the episode, or an arm was no longer finite."""
     truncated: Tensor
     """(B,) bool: the time was out."""
+    failed: Tensor
+    """(B,) bool: terminated because an arm was no longer finite, as after an action of NaN; rewards
+    and final observations are then 0."""
     final_observations: dict[str, Any]
     """agent -> the same: before the reset, for the value of a truncated episode's last state."""
     terms: dict[str, dict[str, Tensor]]
@@ -111,8 +114,10 @@ class BatchedEnv:
     def step(self, actions: Mapping[str, Tensor | np.ndarray]) -> BatchedStep:
         """Advance all environments; actions: agent -> (B, m) kPa, tensors or arrays."""
         shapes = {agent: (self.num_envs, size) for agent, size in self.action_sizes.items()}
+        check_agents(actions, shapes)
         held = actions_of(actions, shapes, self.device)
         state, outcome = self._episodes.step(self._now, held)
+        failed = state.world.failed.clone()
         images = self._drawn(state)
         vectors = self._episodes.observe(state)
         final = self._with_images(vectors, images)
@@ -128,6 +133,7 @@ class BatchedEnv:
             rewards=outcome.rewards,
             terminated=outcome.terminated,
             truncated=outcome.truncated,
+            failed=failed,
             final_observations=final,
             terms=outcome.terms,
             measures=outcome.measures,

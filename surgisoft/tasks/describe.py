@@ -27,6 +27,13 @@ COMMAND = "python -m surgisoft.tasks.describe docs/environments"
 """What writes the pages."""
 
 
+FAILS = (
+    "In every task an episode also terminates, with `failed` in its info, if an arm is no longer "
+    "finite, as after an action of NaN; its observations and rewards are then 0."
+)
+"""How an episode of any task can end, too."""
+
+
 @dataclass(frozen=True)
 class ObservedBlock:
     """A named stretch of an agent's observation."""
@@ -283,7 +290,7 @@ def _page(task: TaskDescription) -> str:
         "```",
         "",
         f"An episode is truncated after {task.steps} steps of {task.dt_s:g} s ({time_s:g} s). "
-        f"Termination: {task.ends[0].lower()}{task.ends[1:]}",
+        f"Termination: {task.ends[0].lower()}{task.ends[1:]} {FAILS}",
         "",
         "Numbers are those of the default configuration and arm model; "
         f'`surgisoft.tasks.describe.describe("{task.name}", config)` gives those of others.',

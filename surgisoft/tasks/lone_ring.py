@@ -174,6 +174,11 @@ class LoneRing:
         return self.completion >= 1.0 or self.collides or self.world.failed
 
     @property
+    def failed(self) -> bool:
+        """An arm is no longer finite."""
+        return self.world.failed
+
+    @property
     def truncated(self) -> bool:
         """The time is out."""
         return self.world.steps >= self.task.steps and not self.terminated

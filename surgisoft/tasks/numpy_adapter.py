@@ -11,6 +11,7 @@ from gymnasium.spaces import Box
 from gymnasium.spaces import Dict as DictSpace
 
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.tasks.arguments import action_of
 from surgisoft.tasks.base import Episodes, LoneEpisode, Outcome, Task, TaskState
 from surgisoft.tasks.observations import OBSERVATION_LIMIT
 from surgisoft.tasks.world.images import VECTOR, images_of
@@ -29,6 +30,9 @@ Bounds = tuple[Any, Any, tuple[int, ...], Any]
 """Lowest value, highest value, shape and dtype: the arguments of a Gymnasium Box."""
 
 
+FAILED = "failed"
+"""Entry of a step's info: whether an arm was no longer finite, as after an action of NaN. The
+episode then ends with observations and rewards of zero."""
 RGB_ARRAY = "rgb_array"
 """The render mode of the environments: pictures as arrays."""
 
@@ -119,12 +123,8 @@ class NumpyAdapter:
         """Agent -> (m,) float32 kPa: the actions of one environment; an InputError for others."""
         held = {}
         for agent in self.task.agents:
-            held[agent] = np.asarray(actions[agent], dtype=np.float32)
             expected = (self.task.world.arms[agent].chambers,)
-            if held[agent].shape != expected:
-                raise InputError(
-                    f"action of '{agent}' has shape {held[agent].shape}, expected {expected}"
-                )
+            held[agent] = action_of(agent, actions[agent], expected)
         return held
 
     @torch.inference_mode()
@@ -135,13 +135,8 @@ class NumpyAdapter:
         count, held = len(state.world.steps), {}
         for agent in self.task.agents:
             expected = (count, self.task.world.arms[agent].chambers)
-            if np.shape(actions[agent]) != expected:
-                raise InputError(
-                    f"action of '{agent}' has shape {np.shape(actions[agent])}, expected {expected}"
-                )
-            held[agent] = torch.tensor(
-                np.asarray(actions[agent]), dtype=torch.float32, device=self.task.world.device
-            )
+            action = action_of(agent, actions[agent], expected)
+            held[agent] = torch.tensor(action, device=self.task.world.device)
         return self.episodes.step(state, held)
 
     @torch.inference_mode()

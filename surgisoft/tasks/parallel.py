@@ -12,9 +12,11 @@ from gymnasium.spaces import Box
 from gymnasium.spaces import Dict as DictSpace
 from pettingzoo import ParallelEnv
 
-from surgisoft.errors import InputError, unknown_name
+from surgisoft.errors import InputError
+from surgisoft.tasks.arguments import check_agents
 from surgisoft.tasks.base import LoneEpisode, Task, TaskState
 from surgisoft.tasks.numpy_adapter import (
+    FAILED,
     RGB_ARRAY,
     NumpyAdapter,
     Pictures,
@@ -30,7 +32,8 @@ class SurgicalEnv(ParallelEnv):
     Actions are changes of the commanded pressure (m,) float32, kPa. Observations are (D,) float32;
     `surgisoft.tasks.describe` lists their entries; with images they are dicts of that `vector` and
     of (H, W, C) arrays. Each agent's info holds its weighted reward
-    terms, and the task's measures where they apply.
+    terms, the task's measures where they apply, and `failed`: whether the episode ended because an
+    arm was no longer finite, as after an action of NaN.
     """
 
     def __init__(self, task: Task, render_mode: str | None = None):
@@ -93,29 +96,29 @@ class SurgicalEnv(ParallelEnv):
     def step(self, actions: dict):
         """Advance one step: (observations, rewards, terminations, truncations, infos) by agent.
 
-        Raises InputError before the first reset, if a live agent has no action, and for the action
-        of an agent that the task does not have.
+        Raises InputError before the first reset, if a live agent has no action, for the action of
+        an agent that the task does not have, and for one that is not (m,) real numbers.
         """
         if self._batch is None:
             raise InputError("step before reset: call reset() first")
         if not self.agents:
             return {}, {}, {}, {}, {}
-        absent = [agent for agent in self.agents if agent not in actions]
-        if absent:
-            raise InputError(f"no action for {', '.join(absent)}: expected one for each live agent")
-        unknown = [agent for agent in actions if agent not in self.possible_agents]
-        if unknown:
-            raise unknown_name("agent", unknown[0], self.possible_agents)
+        check_agents(actions, self.possible_agents)
         if self.lone is not None:
             return self._lone_step(self.lone, actions)
-        held = {agent: np.asarray(actions[agent])[None] for agent in self.agents}
+        held = {agent: one[None] for agent, one in self.adapter.checked(actions).items()}
         self._batch, outcome = self.adapter.step(self._batch, held)
         measures = {
             name: value.item() for name, value in outcome.measures.items() if value.isfinite().all()
         }
         live = self.agents
+        failed = bool(self._batch.world.failed)
         infos = {
-            agent: {**{name: v.item() for name, v in outcome.terms[agent].items()}, **measures}
+            agent: {
+                **{name: v.item() for name, v in outcome.terms[agent].items()},
+                **measures,
+                FAILED: failed,
+            }
             for agent in live
         }
         rewards = {agent: outcome.rewards[agent].item() for agent in live}
@@ -131,7 +134,7 @@ class SurgicalEnv(ParallelEnv):
         lone.step(self.adapter.checked(actions))
         measures = {name: value for name, value in lone.measures.items() if math.isfinite(value)}
         terms, live = lone.terms, self.agents
-        infos = {agent: {**terms[agent], **measures} for agent in live}
+        infos = {agent: {**terms[agent], **measures, FAILED: lone.failed} for agent in live}
         rewards = {agent: sum(terms[agent].values()) for agent in live}
         terminated, truncated = lone.terminated, lone.truncated
         observations = lone.observations

@@ -22,7 +22,14 @@ from surgisoft.environments import register
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.tasks.arguments import whole
 from surgisoft.tasks.base import DocumentedTask, Task, TaskState
-from surgisoft.tasks.numpy_adapter import RGB_ARRAY, NumpyAdapter, Pictures, entropy_seed, in_one
+from surgisoft.tasks.numpy_adapter import (
+    FAILED,
+    RGB_ARRAY,
+    NumpyAdapter,
+    Pictures,
+    entropy_seed,
+    in_one,
+)
 from surgisoft.tasks.observations import ObservationBlocks
 from surgisoft.tasks.registry import make_with
 
@@ -95,7 +102,8 @@ def one_agent(task: Task, agent: str) -> Task:
 class SingleEnv(gymnasium.Env):
     """One environment of a task. Actions (m,) kPa and observations (D,) are float32.
 
-    The info of a step holds the weighted reward terms and the measures that apply.
+    The info of a step holds the weighted reward terms, the measures that apply, and `failed`:
+    whether the episode ended because the arm was no longer finite, as after an action of NaN.
     """
 
     metadata = {"render_modes": [RGB_ARRAY], "render_fps": 10}  # noqa: RUF012  (Gymnasium's form)
@@ -144,11 +152,11 @@ class SingleEnv(gymnasium.Env):
         """
         if self._state is None:
             raise InputError("step before reset: call reset() first")
-        self._state, outcome = self.adapter.step(
-            self._state, {self._agent: np.asarray(action)[None]}
-        )
+        held = self.adapter.checked({self._agent: action})[self._agent]
+        self._state, outcome = self.adapter.step(self._state, {self._agent: held[None]})
         info = {name: value.item() for name, value in outcome.terms[self._agent].items()}
         info |= {n: v.item() for n, v in outcome.measures.items() if v.isfinite().all()}
+        info[FAILED] = bool(self._state.world.failed)
         return (
             in_one(self.adapter.observations(self._state)[self._agent]),
             outcome.rewards[self._agent].item(),
@@ -213,10 +221,12 @@ class BatchedEnv(VectorEnv):
         """
         if self._state is None:
             raise InputError("step before reset: call reset() first")
-        self._state, outcome = self.adapter.step(self._state, {self._agent: np.asarray(actions)})
+        self._state, outcome = self.adapter.step(self._state, {self._agent: actions})
         done, info = outcome.done.cpu().numpy(), {}
         for name, value in {**outcome.terms[self._agent], **outcome.measures}.items():
             info[name], info[f"_{name}"] = value.cpu().numpy(), value.isfinite().cpu().numpy()
+        failed = self._state.world.failed.cpu().numpy().copy()
+        info[FAILED], info[f"_{FAILED}"] = failed, np.ones_like(failed)
         if done.any():
             last = self.adapter.observations(self._state)[self._agent]
             info["final_obs"], info["_final_obs"] = last, done

@@ -8,6 +8,7 @@ from functools import lru_cache
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
@@ -193,7 +194,52 @@ def test_a_nan_action_ends_one_environment_only():
     assert np.isfinite(seen).all()
     assert np.isfinite(rewards).all()
     assert np.isfinite(info["final_obs"]).all()
+    assert info["failed"].tolist() == [False, True, False], "the reason"
+    assert info["_failed"].all()
     assert not many.step(np.zeros((3, 3), np.float32))[2].any()
+
+
+@pytest.mark.parametrize("geometry", ["fcl", "batched"])
+@pytest.mark.parametrize("name", ["track_circle", "circle_ablation"])
+def test_infos_say_that_a_nan_action_ended_the_episode(name, geometry):
+    env = SurgicalEnv(exact(name, geometry))
+    env.reset(seed=0)
+    still = {agent: np.zeros(3, np.float32) for agent in env.possible_agents}
+    *_, infos = env.step(still)
+    assert [infos[agent]["failed"] for agent in still] == [False] * len(still)
+    first = env.possible_agents[0]
+    *_, ended, _, infos = env.step({**still, first: np.array([np.nan, 0.0, 0.0])})
+    assert [ended[agent] for agent in still] == [True] * len(still)
+    assert [infos[agent]["failed"] for agent in still] == [True] * len(still)
+    if name == "track_circle":
+        single = SingleEnv(name)
+        single.reset(seed=0)
+        assert single.step(np.zeros(3))[4]["failed"] is False
+        assert single.step(np.full(3, np.nan))[4]["failed"] is True
+
+
+@pytest.mark.parametrize("name", ["track_circle", "circle_ablation"])
+@pytest.mark.parametrize(
+    "action",
+    [["1", "2", None], np.array(["1", "2", "3"]), np.array([1j, 0.0, 0.0]), None, [[1.0], [2, 3]]],
+    ids=["with None", "digits", "complex", "None", "ragged"],
+)
+def test_an_action_that_is_no_array_of_real_numbers_is_one_line(name, action):
+    env = SurgicalEnv(exact(name))
+    env.reset(seed=0)
+    with pytest.raises(InputError, match="holds something else than real numbers; expected a ten"):
+        env.step(dict.fromkeys(env.possible_agents, action))
+    many = surgisoft.batched_env("track_circle", 1)
+    with pytest.raises(InputError, match="holds something else than real numbers; expected a ten"):
+        many.step({"arm": action})
+
+
+def test_tensors_with_a_gradient_are_actions():
+    env, other = SurgicalEnv(exact("track_circle")), SurgicalEnv(exact("track_circle"))
+    env.reset(seed=0)
+    other.reset(seed=0)
+    seen = env.step({"arm": torch.ones(3, requires_grad=True)})[0]["arm"]
+    np.testing.assert_array_equal(seen, other.step({"arm": np.ones(3)})[0]["arm"])
 
 
 def test_wrong_use_is_one_line():
@@ -201,12 +247,18 @@ def test_wrong_use_is_one_line():
     with pytest.raises(InputError, match="step before reset"):
         env.step({})
     env.reset()
-    with pytest.raises(InputError, match="no action for arm"):
+    with pytest.raises(InputError, match="no action for 'arm'"):
         env.step({"laser": np.zeros(3)})
     with pytest.raises(InputError, match="unknown agent 'laser': known are arm"):
         env.step({"arm": np.zeros(3), "laser": np.zeros(3)})
-    with pytest.raises(InputError, match=r"shape \(1, 2\), expected \(1, 3\)"):
+    with pytest.raises(InputError, match=r"shape \(2,\), expected \(3,\)"):
         env.step({"arm": np.zeros(2)})
+    with pytest.raises(InputError, match="actions are of type list, expected a dict of arm"):
+        env.step([np.zeros(3)])
+    single = SingleEnv("track_circle")
+    single.reset(seed=0)
+    with pytest.raises(InputError, match=r"shape \(2,\), expected \(3,\)"):
+        single.step(np.zeros(2))
     with pytest.raises(InputError, match="step before reset"):
         SingleEnv("track_circle").step(np.zeros(3))
 

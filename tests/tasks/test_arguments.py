@@ -70,7 +70,9 @@ def test_arrays_and_tensors_are_the_same_actions():
     [
         (np.zeros((2, 3)), "actions are of type ndarray, expected a dict of arm"),
         ({}, "no action for 'arm', expected one for each of arm"),
-        ({"arm": "open"}, "action of 'arm' is of type str, expected a tensor or an array of numb"),
+        ({"arm": "open"}, "action of 'arm' is of type str and holds something else than real"),
+        ({"arm": torch.zeros(2, 3, dtype=torch.complex64)}, "holds something else than real num"),
+        ({"arm": np.zeros((2, 3)), "bob": 1}, "unknown agent 'bob': known are arm"),
         ({"arm": np.zeros((2, 4))}, r"action of 'arm' has shape \(2, 4\), expected \(2, 3\)"),
     ],
 )

@@ -72,6 +72,9 @@ def test_wrong_actions_are_one_line():
         env.step({"arm": torch.zeros(1, 3)})
     with pytest.raises(InputError, match="no action for 'arm'"):
         env.step({})
+    step = env.step({"arm": torch.tensor([[0.0, 0.0, 0.0], [torch.nan, 0.0, 0.0]])})
+    assert step.failed.tolist() == step.terminated.tolist() == [False, True]
+    assert not env.step({"arm": torch.zeros(2, 3)}).failed.any(), "it has begun anew"
     with pytest.raises(InputError, match="num_envs is 0"):
         surgisoft.batched_env("track_body", 0)
 

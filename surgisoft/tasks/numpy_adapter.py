@@ -16,6 +16,7 @@ from surgisoft.tasks.base import Episodes, LoneEpisode, Outcome, Task, TaskState
 from surgisoft.tasks.observations import OBSERVATION_LIMIT
 from surgisoft.tasks.world.images import VECTOR, images_of
 from surgisoft.tasks.world.picture import WorldPicture
+from surgisoft.tasks.world.pytree import rows
 from surgisoft.tasks.world.random_streams import joined, streams
 
 
@@ -38,7 +39,7 @@ RGB_ARRAY = "rgb_array"
 
 
 class Pictures:
-    """Pictures of a task's first environment, for the render mode `rgb_array`."""
+    """Pictures of a task's environments, for the render mode `rgb_array`."""
 
     def __init__(self, task: Task, mode: str | None):
         """mode: `rgb_array`, or None for no pictures."""
@@ -47,16 +48,25 @@ class Pictures:
         self._task, self._mode = task, mode
         self._picture: WorldPicture | None = None
 
-    @torch.inference_mode()
     def of(self, state: TaskState | None) -> np.ndarray | None:
-        """(H, W, 3) uint8 picture of a state, made with the camera's first use."""
+        """(H, W, 3) uint8 picture of the first environment, made with the camera's first use."""
+        pictures = self.of_each(state, 1)
+        return pictures[0] if pictures else None
+
+    @torch.inference_mode()
+    def of_each(self, state: TaskState | None, count: int) -> tuple[np.ndarray, ...]:
+        """(H, W, 3) uint8 pictures of the first environments; none without a render mode."""
         if self._mode is None:
-            return None
+            return ()
         if state is None:
             raise InputError("render before reset: call reset() first")
         if self._picture is None:
             self._picture = WorldPicture(self._task.world)
-        return self._picture.image(state.world, self._task.trace(state)[0])
+        found = []
+        for index in range(count):
+            one = rows(state, torch.tensor([index], device=state.world.steps.device))
+            found.append(self._picture.image(one.world, self._task.trace(one)[0]))
+        return tuple(found)
 
 
 def entropy_seed() -> int:

@@ -173,7 +173,11 @@ class SingleEnv(gymnasium.Env):
 class BatchedEnv(VectorEnv):
     """Many environments of a task in one batch; a finished one is reset in the same step."""
 
-    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+    metadata = {  # noqa: RUF012  (Gymnasium's form)
+        "render_modes": [RGB_ARRAY],
+        "render_fps": 10,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
 
     def __init__(
         self,
@@ -184,17 +188,22 @@ class BatchedEnv(VectorEnv):
         scene: str | Path | None = None,
         arm: str | Path | None = None,
         geometry: str | None = None,
+        render_mode: str | None = None,
         agent: str | None = None,
         images: str | None = None,
         image_pixels: int | None = None,
     ):
         """The task's name, and changes to its config as for `registry.make_with`; or a task.
 
-        agent, images and image_pixels are as for `SingleEnv`.
+        render_mode, agent, images and image_pixels are as for `SingleEnv`.
         """
         num_envs = whole("num_envs", num_envs, 1)
         shown = (agent, images, image_pixels)
         self.adapter, self._agent = _adapter(task, config, device, scene, arm, geometry, *shown)
+        self._pictures = Pictures(self.adapter.task, render_mode)
+        self.render_mode = render_mode
+        fps = round(1.0 / self.adapter.task.world.config.dt_s)
+        self.metadata = {**self.metadata, "render_fps": fps}
         self._state: TaskState | None = None
         self.num_envs = num_envs
         self.single_observation_space = self.adapter.observation_space(self._agent)
@@ -238,6 +247,10 @@ class BatchedEnv(VectorEnv):
             outcome.truncated.cpu().numpy(),
             info,
         )
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """(H, W, 3) uint8 of every environment from outside; None without a render mode."""
+        return self._pictures.of_each(self._state, self.num_envs) or None
 
 
 register()

@@ -10,6 +10,7 @@ import surgisoft
 from surgisoft.errors import InputError
 from surgisoft.tasks.circle_ablation import CircleAblation
 from surgisoft.tasks.registry import config_of, with_fields
+from surgisoft.tasks.single import BatchedEnv
 
 
 def drawn(env, generator):
@@ -107,6 +108,30 @@ def test_pictures_show_the_arm_where_it_is():
     assert all(500 < len(arm) < 20_000 for arm in arms)
     tops = [arm[arm[:, 0] < arm[:, 0].min() + 15].mean(0) for arm in arms]
     assert np.abs(tops[1] - tops[0]).max() > 10
+
+
+def test_a_vector_environment_has_a_picture_of_each_of_its_environments():
+    """Those of single environments of the same seeds and actions."""
+    many = gymnasium.make_vec("surgisoft/track_body-v0", num_envs=2, render_mode="rgb_array")
+    with pytest.raises(InputError, match="render before reset"):
+        many.render()
+    many.reset(seed=3)
+    actions = np.array([[3.0, -3.0, -3.0], [-3.0, 3.0, 0.0]], np.float32)
+    many.step(actions)
+    pictures = many.render()
+    assert len(pictures) == 2
+    assert not np.array_equal(*pictures)
+    for i, picture in enumerate(pictures):
+        env = gymnasium.make("surgisoft/track_body-v0", render_mode="rgb_array")
+        env.reset(seed=3 + i)
+        env.step(actions[i])
+        different = np.abs(env.render().astype(int) - picture).max(2) > 8
+        assert different.mean() < 1e-3
+    plain = gymnasium.make_vec("surgisoft/track_body-v0", num_envs=2)
+    plain.reset(seed=0)
+    assert plain.render() is None
+    with pytest.raises(InputError, match="unknown render_mode 'human'"):
+        BatchedEnv("track_body", 2, render_mode="human")
 
 
 def test_two_arms_have_pictures_too_and_others_have_none():

@@ -20,7 +20,7 @@ from surgisoft.memory import keep_freed_memory
 from surgisoft.tasks.arguments import actions_of, check_agents, whole
 from surgisoft.tasks.base import Task, TaskState
 from surgisoft.tasks.graphed import donated_episodes
-from surgisoft.tasks.registry import make_with
+from surgisoft.tasks.registry import task_of
 from surgisoft.tasks.world.images import VECTOR, images_of
 from surgisoft.tasks.world.pytree import tree_map
 from surgisoft.tasks.world.random_streams import episode_streams
@@ -187,10 +187,8 @@ def batched_env(
     task: name of the task, or a task; the other arguments are those of `parallel_env` and of
     `BatchedEnv`.
     """
-    if isinstance(task, str):
-        task = make_with(task, config, device, scene, arm, geometry, images, image_pixels)
-    if not hasattr(task, "world"):
-        raise InputError(
-            f"task is of type {type(task).__name__}, expected the name of a task or a task"
-        )
-    return BatchedEnv(task, num_envs, seed, spread)
+    built = task_of(
+        task, device, config=config, scene=scene, arm=arm, geometry=geometry, images=images,
+        image_pixels=image_pixels,
+    )  # fmt: skip
+    return BatchedEnv(built, num_envs, seed, spread)

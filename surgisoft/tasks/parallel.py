@@ -23,7 +23,7 @@ from surgisoft.tasks.numpy_adapter import (
     entropy_seed,
     in_one,
 )
-from surgisoft.tasks.registry import make_with
+from surgisoft.tasks.registry import task_of
 
 
 class SurgicalEnv(ParallelEnv):
@@ -169,7 +169,7 @@ class SurgicalEnv(ParallelEnv):
 
 
 def parallel_env(
-    task: str,
+    task: str | Task,
     config: Any = None,
     device: str | torch.device = "cpu",
     scene: str | Path | None = None,
@@ -179,18 +179,22 @@ def parallel_env(
     images: str | None = None,
     image_pixels: int | None = None,
 ) -> SurgicalEnv:
-    """The named task as a PettingZoo ParallelEnv.
+    """The named task, or a task, as a PettingZoo ParallelEnv.
 
     Observations (D,) are scaled to the order of 1 (docs/environments), actions (m,) are changes of
     the commanded pressure, kPa, both float32. Raises InputError for an unknown task, scene or
     field.
 
-    config: the task's whole config, None: its default one. scene: a scene's folder. arm: an arm
+    task: its name, or a task that is built already, which the arguments from config to image_pixels
+    do not change. config: the task's whole config, None: its default one. scene: a scene's folder. arm: an arm
     model's folder or `default`. None leaves scene or arm as the config has it. geometry: `fcl`, the
     exact collision checker, or `batched`, the faster engine of training, for contact and for the
     beam's hit; near contact the two agree to 0.1 mm. render_mode: `rgb_array`, for pictures by
     `render`, or None. images: `rgb`, `depth`, `segmentation` with commas in between: what the
     endoscope shows, in observations that are then dicts; image_pixels: its width and height.
     """
-    built = make_with(task, config, device, scene, arm, geometry, images, image_pixels)
+    built = task_of(
+        task, device, config=config, scene=scene, arm=arm, geometry=geometry, images=images,
+        image_pixels=image_pixels,
+    )  # fmt: skip
     return SurgicalEnv(built, render_mode)

@@ -199,6 +199,27 @@ def make_with(
     return make_task(name, with_fields(config, **given), device_of(device))
 
 
+def task_of(task: str | Task, device: str | torch.device = "cpu", **changes: Any) -> Task:
+    """The named task with changes as for `make_with`, or a task that is built already.
+
+    The latter has its own configuration, device and geometry. Raises InputError for another object,
+    and for a change of the configuration beside a built task.
+    """
+    if isinstance(task, str):
+        return make_with(task, device=device, **changes)
+    if not hasattr(task, "world"):
+        raise InputError(
+            f"task is of type {type(task).__name__}, expected the name of a task or a task"
+        )
+    beside = [name for name in changes if name != "geometry" and changes[name] is not None]
+    if beside:
+        raise InputError(
+            f"{beside[0]} is given beside the task '{task.name}', which is built already; build the "
+            f"task with it, or name the task"
+        )
+    return task
+
+
 def config_of(task: str) -> Any:
     """The named task's default configuration."""
     return spec_of(task).config

@@ -31,7 +31,7 @@ from surgisoft.tasks.numpy_adapter import (
     in_one,
 )
 from surgisoft.tasks.observations import ObservationBlocks
-from surgisoft.tasks.registry import make_with
+from surgisoft.tasks.registry import task_of
 
 
 def _adapter(
@@ -49,8 +49,10 @@ def _adapter(
 
     agent: the one that learns in a task of several, see `OneAgent`.
     """
-    if isinstance(task, str):
-        task = make_with(task, config, device, scene, arm, geometry, images, image_pixels)
+    task = task_of(
+        task, device, config=config, scene=scene, arm=arm, geometry=geometry, images=images,
+        image_pixels=image_pixels,
+    )  # fmt: skip
     if agent is not None:
         task = one_agent(task, agent)
     if len(task.agents) != 1:

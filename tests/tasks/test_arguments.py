@@ -7,7 +7,10 @@ import torch
 import surgisoft
 from surgisoft.errors import InputError
 from surgisoft.tasks.arguments import device_of
-from surgisoft.tasks.single import BatchedEnv
+from surgisoft.tasks.path_following import FollowConfig
+from surgisoft.tasks.registry import make_task
+from surgisoft.tasks.single import BatchedEnv, SingleEnv
+from surgisoft.tasks.track import TrackConfig
 
 WRONG = [
     ({"device": "tpu"}, "device 'tpu': expected cpu or cuda"),
@@ -31,6 +34,26 @@ def test_a_wrong_argument_of_a_batch_is_one_line(wrong, says):
         surgisoft.batched_env(**{"task": "circle_ablation", "num_envs": 2} | wrong)
     assert str(error.value).startswith(says)
     assert "\n" not in str(error.value)
+
+
+MAKES = [
+    surgisoft.parallel_env,
+    lambda task, **given: surgisoft.batched_env(task, 1, **given),
+    SingleEnv,
+    lambda task, **given: BatchedEnv(task, 1, **given),
+]
+
+
+@pytest.mark.parametrize("make", MAKES, ids=["parallel", "batched", "single", "vector"])
+def test_every_environment_is_made_of_a_task_too(make):
+    task = make_task("track_circle", TrackConfig(FollowConfig(loop_s=1.0, approach_s=0.5)))
+    env = make(task)
+    assert getattr(env, "task", None) is task or env.adapter.task is task
+    with pytest.raises(InputError, match="task is of type object, expected the name of a task or"):
+        make(object())
+    for field in ("config", "arm", "images"):
+        with pytest.raises(InputError, match=f"{field} is given beside the task 'track_circle'"):
+            make(task, **{field: "default"})
 
 
 def test_a_gpu_that_is_not_there_is_one_line(monkeypatch):

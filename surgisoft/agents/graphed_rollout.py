@@ -16,7 +16,7 @@ from rsl_rl.algorithms import PPO
 from tensordict import TensorDict
 from torch import Tensor
 
-from surgisoft.agents.ppo import RolloutMeans, collect_rollout, groups_of
+from surgisoft.agents.ppo import MEASURE, RolloutMeans, collect_rollout, groups_of
 from surgisoft.agents.vec_env import JointEnv
 from surgisoft.cuda_graph import cuda_graph, recorded
 from surgisoft.tasks.base import Outcome
@@ -105,12 +105,16 @@ class GraphedRollout:
         overwrite(self._seen.to_dict(), seen.to_dict())
 
     def _ended(self) -> Tensor:
-        """Returns and advantages of the agents; the mean of every note where it is finite."""
+        """Returns and advantages of the agents; the mean of every note, of measures where they are
+        finite."""
         for agent, ppo in self.agents.items():
             ppo.compute_returns(self._views[agent])
-        assert self._notes is not None
+        assert self._notes is not None and self.latest is not None
         every = self._notes.transpose(0, 1).flatten(1)
         known = every.isfinite()
+        # By slices: a graph cannot copy a list of names. Measures stand between terms and `done`.
+        measures = sum(name.startswith(MEASURE) for name in self.latest[3])
+        known[: len(every) - 1 - measures] = True
         return every.where(known, 0.0).sum(1) / known.sum(1)
 
     def _done(self, name: str, work: Callable[[], Any]) -> Any:
@@ -132,5 +136,5 @@ def notes_of(outcome: Outcome) -> dict[str, Tensor]:
     notes = {f"reward/{agent}": value for agent, value in outcome.rewards.items()}
     for agent, terms in outcome.terms.items():
         notes |= {f"term/{agent}/{term}": value for term, value in terms.items()}
-    notes |= {f"measure/{name}": value for name, value in outcome.measures.items()}
+    notes |= {f"{MEASURE}{name}": value for name, value in outcome.measures.items()}
     return {**notes, "done": outcome.done}

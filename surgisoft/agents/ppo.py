@@ -149,6 +149,10 @@ def update(ppo: PPO) -> dict[str, float]:
     return ppo.update()
 
 
+MEASURE = "measure/"
+"""What the names of measures begin with, among the means of a rollout."""
+
+
 @dataclass(frozen=True, eq=False)
 class RolloutMeans:
     """Means over the steps of a rollout."""
@@ -156,7 +160,7 @@ class RolloutMeans:
     rewards: dict[str, float]
     """agent -> reward of a step."""
     terms: dict[str, float]
-    """agent/term -> reward of a step."""
+    """agent/term -> reward of a step; nan or infinite where it was in any step."""
     measures: dict[str, float]
     """name -> measure, where it applies; nan where it never did."""
     episodes: int
@@ -170,7 +174,7 @@ class RolloutMeans:
         def part(prefix: str) -> dict[str, float]:
             return {n.removeprefix(prefix): v for n, v in means.items() if n.startswith(prefix)}
 
-        return cls(part("reward/"), part("term/"), part("measure/"), round(means["done"] * rows))
+        return cls(part("reward/"), part("term/"), part(MEASURE), round(means["done"] * rows))
 
 
 @torch.inference_mode()
@@ -197,16 +201,16 @@ def collect_rollout(env: JointEnv, agents: dict[str, PPO], seen: TensorDict, ste
             for term, value in extras["terms"][agent].items():
                 note(f"term/{agent}/{term}", value)
         for name, value in extras["measures"].items():
-            note(f"measure/{name}", value)
+            note(f"{MEASURE}{name}", value)
         note("done", dones)
     for agent, ppo in agents.items():
         ppo.compute_returns(seen.select(*groups[agent]))
-    means = {name: _mean(values) for name, values in notes.items()}
+    means = {name: _mean(values, name) for name, values in notes.items()}
     return seen, RolloutMeans.of(means, steps * env.num_envs)
 
 
-def _mean(values: list[Tensor]) -> float:
-    """Mean of what is finite in (T, B) values; nan where nothing is."""
+def _mean(values: list[Tensor], name: str) -> float:
+    """Mean of (T, B) values; of a measure that of its finite ones, nan where nothing is."""
     every = torch.stack(values).float()
-    known = every.isfinite()
+    known = every.isfinite() if name.startswith(MEASURE) else torch.ones_like(every, dtype=bool)
     return (every.where(known, 0.0).sum() / known.sum()).item()

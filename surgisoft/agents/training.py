@@ -138,6 +138,7 @@ class Training:
         for ppo in self.agents.values():
             set_noise(ppo, preset, self.share)
         self.seen, gathered = self._rolled_out(self.seen)
+        self._check_terms(gathered)
         losses: dict[str, float] = {}
         for agent, ppo in self.agents.items():
             try:
@@ -156,6 +157,19 @@ class Training:
         first = next(iter(self.agents.values()))
         noise = first.get_policy().distribution.log_std_param.detach().exp().mean().item()
         return Iteration(gathered, losses, first.learning_rate, noise)
+
+    def _check_terms(self, gathered: RolloutMeans) -> None:
+        """Raise InputError where a reward term is not finite: what is learned of it is nothing."""
+        bad = [name for name, value in gathered.terms.items() if not math.isfinite(value)]
+        if self.processes.any(bool(bad)):
+            named = [f"'{term}' of '{agent}'" for agent, _, term in (n.partition("/") for n in bad)]
+            preset = self.plan.preset
+            steps = (self.iteration + 1) * preset.envs * preset.rollout * self.processes.count
+            which = f"reward term {', '.join(named)}" if named else "a reward term"
+            raise InputError(
+                f"{which} is NaN or infinite within the first {steps:,} steps; correct the rewards "
+                f"of the task '{self.plan.task}'"
+            )
 
     def _diverged(self, agents: str) -> InputError:
         """The error where weights are not finite: nothing is learned any more."""

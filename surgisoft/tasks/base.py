@@ -221,6 +221,56 @@ class Outcome:
         return self.terminated | self.truncated
 
 
+def reward_terms(task: Task, state: TaskState) -> dict[str, dict[str, Tensor]]:
+    """The task's rewards for reaching a state: agent -> term -> (B,), zero where an arm failed.
+
+    Raises InputError for what is not of this form, which a user-defined `rewards` may return.
+    """
+    found: Any = task.rewards(state)
+    name, failed = f"rewards of the task '{task.name}'", state.world.failed
+    if not isinstance(found, Mapping) or found.keys() != set(task.agents):
+        is_ = f"of {', '.join(map(str, found))}" if isinstance(found, Mapping) else _type(found)
+        raise InputError(f"{name} are {is_}, expected a dict of {', '.join(task.agents)}")
+    terms: dict[str, dict[str, Tensor]] = {agent: {} for agent in found}
+    for agent, parts in found.items():
+        if not isinstance(parts, Mapping) or not parts:
+            raise InputError(
+                f"{name} for '{agent}' are {_type(parts)}, expected a dict of at least one term by "
+                "its name, each a tensor (B,)"
+            )
+        for term, value in parts.items():
+            if not isinstance(value, Tensor) or value.shape != failed.shape:
+                shape = f"of shape {tuple(value.shape)}" if isinstance(value, Tensor) else ""
+                raise InputError(
+                    f"{name}: term '{term}' of '{agent}' is {shape or _type(value)}, expected a "
+                    f"tensor of shape {tuple(failed.shape)}, one value for each environment"
+                )
+            terms[agent][term] = value.masked_fill(failed, 0.0)
+    return terms
+
+
+def _type(value: Any) -> str:
+    """Type of a value in words, of an empty dict that it is one."""
+    empty = isinstance(value, Mapping) and not value
+    return "an empty dict" if empty else f"of type {type(value).__name__}"
+
+
+def check_finite(task: Task, terms: Mapping[str, Mapping[str, Tensor]]) -> None:
+    """Raise InputError where a reward term is NaN or infinite, of which no policy can learn.
+
+    On a GPU, whose results the caller does not wait for, nothing is checked.
+    """
+    if task.world.device.type != "cpu":
+        return
+    for agent, parts in terms.items():
+        for term, value in parts.items():
+            if bad := int((~value.isfinite()).sum()):
+                raise InputError(
+                    f"rewards of the task '{task.name}': term '{term}' of '{agent}' is NaN or "
+                    f"infinite in {bad} of {len(value)} environments; correct this term"
+                )
+
+
 class Episodes:
     """The loop of a task's episodes: start, step, observe and reset. Holds no state.
 
@@ -259,10 +309,7 @@ class Episodes:
         task = self.task
         state = task.advance(state, actions)
         failed = state.world.failed
-        terms = {
-            agent: {name: value.masked_fill(failed, 0.0) for name, value in parts.items()}
-            for agent, parts in task.rewards(state).items()
-        }
+        terms = reward_terms(task, state)
         terminated = task.ended(state) | failed
         truncated = (state.world.steps >= task.steps) & ~terminated
         return state, Outcome(terms, terminated, truncated, task.measures(state))

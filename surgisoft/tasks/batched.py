@@ -18,7 +18,7 @@ from torch import Tensor
 from surgisoft.errors import InputError
 from surgisoft.memory import keep_freed_memory
 from surgisoft.tasks.arguments import actions_of, check_agents, whole
-from surgisoft.tasks.base import Task, TaskState
+from surgisoft.tasks.base import Task, TaskState, check_finite
 from surgisoft.tasks.graphed import donated_episodes
 from surgisoft.tasks.registry import task_of
 from surgisoft.tasks.world.images import VECTOR, images_of
@@ -117,6 +117,7 @@ class BatchedEnv:
         check_agents(actions, shapes)
         held = actions_of(actions, shapes, self.device)
         state, outcome = self._episodes.step(self._now, held)
+        check_finite(self.task, outcome.terms)
         failed = state.world.failed.clone()
         images = self._drawn(state)
         vectors = self._episodes.observe(state)

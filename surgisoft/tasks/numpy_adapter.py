@@ -12,7 +12,14 @@ from gymnasium.spaces import Dict as DictSpace
 
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.tasks.arguments import action_of
-from surgisoft.tasks.base import Episodes, LoneEpisode, Outcome, Task, TaskState
+from surgisoft.tasks.base import (
+    Episodes,
+    LoneEpisode,
+    Outcome,
+    Task,
+    TaskState,
+    check_finite,
+)
 from surgisoft.tasks.observations import OBSERVATION_LIMIT
 from surgisoft.tasks.world.images import VECTOR, images_of
 from surgisoft.tasks.world.picture import WorldPicture
@@ -147,7 +154,9 @@ class NumpyAdapter:
             expected = (count, self.task.world.arms[agent].chambers)
             action = action_of(agent, actions[agent], expected)
             held[agent] = torch.tensor(action, device=self.task.world.device)
-        return self.episodes.step(state, held)
+        state, outcome = self.episodes.step(state, held)
+        check_finite(self.task, outcome.terms)
+        return state, outcome
 
     @torch.inference_mode()
     def observations(self, state: TaskState) -> dict[str, Any]:

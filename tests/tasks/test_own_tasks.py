@@ -13,6 +13,7 @@ import surgisoft
 from surgisoft.cli import run
 from surgisoft.errors import InputError
 from surgisoft.tasks.registry import TASKS, make_task, spec_of, task_names
+from surgisoft.tasks.single import BatchedEnv
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "tasks.md"
 
@@ -72,6 +73,62 @@ def test_it_is_trained_and_evaluated_by_its_name(installed, tmp_path, monkeypatc
     told = capsys.readouterr().err
     assert "own: was trained on the task 'smooth_circle', which is not installed here" in told
     assert f"install {config['task_package']} first" in told
+
+
+def of_rewards(rewards):
+    """`track_circle` whose rewards are those of a function of the state."""
+    task = make_task("track_circle")
+    task.rewards = rewards
+    return task
+
+
+WRONG_REWARDS = [
+    (lambda state: {"arm": {"x": 1.0}}, "term 'x' of 'arm' is of type float, expected a tensor of"),
+    (lambda state: {"arm": {"x": torch.ones(3)}}, r"'x' of 'arm' is of shape \(3,\), .* \(2,\), one"),
+    (lambda state: {"arm": torch.ones(2)}, "for 'arm' are of type Tensor, expected a dict of at l"),
+    (lambda state: {"arm": {}}, "for 'arm' are an empty dict, expected a dict of at least one"),
+    (lambda state: {"bob": {"x": torch.ones(2)}}, "are of bob, expected a dict of arm"),
+    (lambda state: torch.ones(2), "are of type Tensor, expected a dict of arm"),
+    (
+        lambda state: {"arm": {"x": torch.ones(2), "y": torch.tensor([0.0, torch.nan])}},
+        "term 'y' of 'arm' is NaN or infinite in 1 of 2 environments",
+    ),
+]
+
+
+@pytest.mark.parametrize(("rewards", "says"), WRONG_REWARDS, ids=[s[:24] for _, s in WRONG_REWARDS])
+def test_wrong_rewards_are_one_line_that_names_the_term(rewards, says):
+    for env, still in (
+        (surgisoft.batched_env(of_rewards(rewards), 2), {"arm": torch.zeros(2, 3)}),
+        (BatchedEnv(of_rewards(rewards), 2), torch.zeros(2, 3)),
+    ):
+        env.reset(seed=0)
+        with pytest.raises(InputError, match=f"rewards of the task 'track_circle'.*{says}"):
+            env.step(still)
+
+
+def test_rewards_of_an_arm_that_failed_may_be_nan():
+    """They are 0: the arm is no longer finite, and so is what is computed of it."""
+    env = surgisoft.batched_env("track_circle", 2)
+    step = env.step({"arm": torch.tensor([[0.0, 0.0, 0.0], [torch.nan, 0.0, 0.0]])})
+    assert step.rewards["arm"][1] == 0.0
+
+
+def test_a_training_names_the_reward_term_that_is_nan(installed, tmp_path, monkeypatch, capsys):
+    """Not its learning rate, which is as it should be."""
+    monkeypatch.chdir(tmp_path)
+    own = type(make_task("smooth_circle"))
+    plain = own.rewards
+
+    def spoilt(task, state):
+        return {"arm": {**plain(task, state)["arm"], "smooth": torch.nan * state.world.steps}}
+
+    monkeypatch.setattr(own, "rewards", spoilt)
+    options = "--task smooth_circle --steps 512 --envs 32 ppo.evaluation_episodes=2 -o own"
+    assert run(["train", *options.split()]) == 2
+    told = capsys.readouterr().err
+    assert "reward term 'smooth' of 'arm' is NaN or infinite within the first 384 steps" in told
+    assert "correct the rewards of the task 'smooth_circle'" in told
 
 
 def test_what_a_package_offers_is_checked(installed):

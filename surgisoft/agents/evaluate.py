@@ -27,6 +27,7 @@ SUMMARIES: dict[str, Callable[[Rollout, str], Tensor]] = {
     "largest_gap_mm": Rollout.end,
     "healthy_mm2": Rollout.end,
     "inside_mm2": Rollout.end,
+    "passes": Rollout.end,
     "visited": Rollout.end,
     "at_rim_s": Rollout.end,
     "success": Rollout.end,
@@ -40,8 +41,9 @@ RATES = ("success", "collided", "failed")
 """Numbers of an episode that are 0 or 1: their mean is a rate."""
 SHARES = ("completion", "view_fraction", "in_view", "visited")
 """Numbers of an episode from 0 to 1: an interval of their mean ends there."""
-SIZES = ("_gap_mm", "_mm2", "_s")
-"""Ends of the names of numbers that are never negative, besides errors: gaps, areas and times."""
+SIZES = ("_gap_mm", "_mm2", "_s", "passes")
+"""Ends of the names of numbers that are never negative, besides errors: gaps, areas, times, counts.
+"""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
 """Two arms treat a lesion's whole surface to a dose and spare the healthy tissue beyond a margin.
 
 The laser, defocused to a wider spot, follows a raster over the inside of each outline; a policy may
-leave it by as much as `fire_mm`. The result is the dose map: which share of the lesion has the dose
+leave it by as much as `fire_mm`. At the end of the raster the reference begins it again, until the
+lesion is treated or the time is out: the measure `passes` counts them. The result is the dose map: which share of the lesion has the dose
 and how much healthy tissue was ablated.
 """
 
@@ -83,7 +84,8 @@ class AreaAblationConfig(LaserConfig):
     spot_mm: float = 2.0
     """Diameter of the defocused beam on the tissue at 1/e^2, mm."""
     pitch_mm: float = 1.2
-    """Distance of neighbouring lines of the raster, mm."""
+    """Distance of neighbouring lines of the raster, mm. Where they leave gaps, further passes burn the
+    same lines again."""
     overrun_mm: float = 0.5
     """Distance by which the raster reaches beyond the outline, so that its edge has the dose, mm.
     """
@@ -181,13 +183,17 @@ class AreaAblation(RouteTask):
         return (share >= self.config.treated_share) | clearance(state).collides
 
     def measures(self, state: TaskState[RouteProgress]) -> dict[str, Tensor]:
-        """Beam error, treated share, healthy tissue ablated, view, clearance, success."""
+        """Beam error, treated share, healthy tissue ablated, view, clearance, success.
+
+        passes: how often the raster was followed, a number with its fraction.
+        """
         share, healthy = self.treated(state)
         done = (share >= self.config.treated_share) & (healthy <= self.config.healthy_mm2)
         return {
             **self.errors(state),
             "completion": share,
             "healthy_mm2": healthy,
+            "passes": state.goal.done / state.goal.steps,
             **self.safety(state, done),
         }
 
@@ -201,7 +207,7 @@ AREA_ABLATION = TaskSpec(
     experiment=laser_experiment(
         "share of the area treated",
         {"treated": Condition("this share of the area has the dose (0..1)", 0.98, completed, 1.0)},
-        {},
+        {"passes": "passes of the raster"},
     ),
     success_rule=success_rule,
 )

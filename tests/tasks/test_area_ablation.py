@@ -49,6 +49,24 @@ def test_the_expert_gives_the_dose_and_spares_the_rest():
         assert healthy.item() == pytest.approx(patch.areas_mm2[burnt].sum(), abs=1e-3)
 
 
+def test_a_raster_with_gaps_is_followed_again_and_its_passes_are_counted():
+    """Against the changes of the reference point, of which a pass has as many as the raster."""
+    task = AreaAblation(replace(SPOT, pitch_mm=3.0, time_s=12.0))
+    episodes = Episodes(task)
+    state = episodes.seeded(0, 1)
+    points, moved = len(task.scene.path_mm), 0
+    with torch.inference_mode():
+        for _ in range(task.steps):
+            before = task.target_mm(state)
+            state, outcome = episodes.step(state, task.script(state))
+            moved += int((task.target_mm(state) != before).any())
+            if outcome.terminated.all():
+                break
+    assert moved > 1.5 * points, "more than one pass"
+    assert outcome.measures["passes"].item() == pytest.approx(moved / points, rel=1e-6)
+    assert outcome.measures["completion"].item() < 0.98
+
+
 def test_healthy_tissue_beyond_the_margin_counts_against_it():
     """A raster that runs 3 mm over an outline with a margin of half a millimetre."""
     task = AreaAblation(replace(SPOT, overrun_mm=3.0, spared_mm=0.5, time_s=30.0))

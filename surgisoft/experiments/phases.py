@@ -13,7 +13,7 @@ from torch import Tensor
 from surgisoft.errors import InputError
 from surgisoft.experiments.spec import Experiment
 from surgisoft.tasks.base import TaskState
-from surgisoft.tasks.episodes.log import EpisodeLog
+from surgisoft.tasks.episodes.log import EARLY, EpisodeLog
 from surgisoft.tasks.episodes.parts import Event
 from surgisoft.tasks.registry import MOST_STEPS
 from surgisoft.tasks.supervision import Supervision
@@ -42,6 +42,9 @@ class PhaseState:
     """(B,) int64: reason of the abort, see `REASONS`."""
     where: Tensor
     """(B,) int64: phase of the abort."""
+    late: Tensor
+    """(B,) int64: one more than the number of the last phase whose time was out before its condition
+    held, and after which the next one followed; 0: none."""
 
 
 class PhasedTask:
@@ -79,6 +82,7 @@ class PhasedTask:
         self.timeouts = row(max(1, round(p.timeout_s / dt_s)) for p in spec.phases)
         self.holds = row(round(p.hold_s / dt_s) for p in spec.phases)
         self.beam = row((p.beam for p in spec.phases), torch.bool)
+        self.timed = row((p.until == "never" for p in spec.phases), torch.bool)
         self.strict = row((p.on_timeout == "abort" for p in spec.phases), torch.bool)
         for fault in spec.faults:
             chambers = self.world.arms[fault.arm].chambers
@@ -95,7 +99,7 @@ class PhasedTask:
         """Draw goals of the underlying task; every episode begins in phase 0."""
         stream, goal = self.base.goal(stream)
         zero = torch.zeros_like(stream.count)
-        return stream, PhaseState(goal, zero, zero, zero, zero, zero, zero)
+        return stream, PhaseState(goal, zero, zero, zero, zero, zero, zero, zero)
 
     def in_sight(self, state: TaskState) -> Tensor:
         """(B,) bool: the target is seen well enough to work on it."""
@@ -156,6 +160,8 @@ class PhasedTask:
         phase = phase.where((old.reason == RUNNING) | (phase == old.phase), len(self.phases))
         phase = phase.where(~newly, self.retreat)
         moved = (phase != old.phase) | newly
+        passed = late & ~self.strict[old.phase] & ~self.timed[old.phase] & ~newly
+        passed = passed & (old.reason == RUNNING)
         return PhaseState(
             goal=after.goal,
             phase=phase.clamp(max=len(self.phases)),
@@ -164,6 +170,7 @@ class PhasedTask:
             lost=lost,
             reason=reason.where(newly, old.reason),
             where=old.phase.where(newly, old.where),
+            late=(old.phase + 1).where(passed, old.late),
         )
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
@@ -196,6 +203,7 @@ class PhasedTask:
             "phase": goal.phase.float(),
             "reason": goal.reason.float(),
             "reason_phase": goal.where.float(),
+            "late_phase": goal.late.float(),
             "beam": fired.float(),
             "beam_unsafe": (fired & ~self.safe(state)).float(),
             "safe": self.safe(state).float(),
@@ -211,11 +219,19 @@ class PhasedTask:
 
 
 def with_phase_events(spec: Experiment, log: EpisodeLog) -> EpisodeLog:
-    """The log of a phased episode with phases, faults and the abort's reason among its events."""
+    """The log of a phased episode with phases, faults and the abort's reason among its events.
+
+    A phase whose time was out before its condition held is a warning. Where the phases ended the
+    episode without success, this is said in place of an early end.
+    """
     phase, reason = (log.measures[name].astype(int) for name in ("phase", "reason"))
     names = [f"phase {phase.name}" for phase in spec.phases] + ["all phases done"]
     begins = [0, *(np.flatnonzero(np.diff(phase)) + 1)]
-    found = [Event(float(log.time_s[row]), "info", names[phase[row]]) for row in begins]
+    late = log.measures.get("late_phase", np.zeros(log.rows)).astype(int)
+    found = []
+    for row in np.flatnonzero(np.diff(late, prepend=0)):
+        found.append(Event(float(log.time_s[row]), "warning", _out_of_time(spec, late[row] - 1)))
+    found += [Event(float(log.time_s[row]), "info", names[phase[row]]) for row in begins]
     for row in np.flatnonzero(reason > RUNNING)[:1]:
         text = f"aborted: {REASONS[reason[row]]}"
         found.append(Event(float(log.time_s[row]), "error", text))
@@ -223,5 +239,15 @@ def with_phase_events(spec: Experiment, log: EpisodeLog) -> EpisodeLog:
         if fault.at_s <= log.time_s[-1]:
             text = f"fault: chamber {fault.chamber} of {fault.arm} goes to 0 kPa"
             found.append(Event(fault.at_s, "warning", text))
-    events = sorted((*log.events, *found), key=lambda event: event.time_s)
+    others = log.events
+    if phase[-1] == len(spec.phases) and others and others[-1].text == EARLY:
+        others = others[:-1]
+        found.append(replace(log.events[-1], level="warning", text="ended without success"))
+    events = sorted((*others, *found), key=lambda event: event.time_s)
     return replace(log, events=tuple(events))
+
+
+def _out_of_time(spec: Experiment, number: int) -> str:
+    """Text of the event that a phase ended by its time."""
+    phase = spec.phases[number]
+    return f"time out in phase {phase.name}: '{phase.until}' not met in {phase.timeout_s:g} s"

@@ -68,7 +68,7 @@ WITH = " with "
 LIBRARIES = {"surgisoft", "torch", "numpy", "scipy"}
 """Folders whose lines are not named as those that raised an exception, where it went through code
 that lies elsewhere, such as that of the user's task."""
-DROPPED = ("phase", "reason", "reason_phase", "beam", "beam_unsafe", "safe")
+DROPPED = ("phase", "reason", "reason_phase", "late_phase", "beam", "beam_unsafe", "safe")
 """Measures of single steps whose means mean nothing."""
 
 
@@ -628,6 +628,7 @@ def _longest(on: Tensor) -> Tensor:
 def _outcomes(task: PhasedTask, result: Rollout, checks: list[EpisodeCheck] | None) -> list[str]:
     """How each episode ended, in words."""
     reason, where = result.end("reason").tolist(), result.end("reason_phase").tolist()
+    late = result.end("late_phase").tolist()
     names, found = [phase.name for phase in task.phases], []
     for i in range(result.episodes):
         contact = None if checks is None else checks[i].contact
@@ -638,5 +639,7 @@ def _outcomes(task: PhasedTask, result: Rollout, checks: list[EpisodeCheck] | No
         elif reason[i]:
             found.append(f"aborted in {names[int(where[i])]}: {REASONS[int(reason[i])]}")
         else:
-            found.append("done" if result.terminated[i] else "time out")
+            how = "done" if result.terminated[i] else "time out"
+            after = f"; {names[int(late[i]) - 1]} took too long" if late[i] else ""
+            found.append(how + after)
     return found

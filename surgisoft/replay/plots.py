@@ -29,6 +29,7 @@ SHOWN_ELSEWHERE = (
     "phase",
     "reason",
     "reason_phase",
+    "late_phase",
     "beam",
     "beam_unsafe",
 )

@@ -155,6 +155,32 @@ def test_a_condition_that_is_met_at_the_last_moment_is_in_time(
     state = replace(cutting[1], goal=replace(cutting[1].goal, phase=cutting[1].goal.phase * 0))
     goal = _walk(task, state, 2, fraction=seen, clearance=20.0)
     assert (goal.reason.tolist(), goal.phase.tolist()) == ([reason] * 2, [phase] * 2)
+    assert goal.late.tolist() == [0, 0], "an abort has its reason"
+    look = replace(look, on_timeout="go on")
+    task = PhasedTask(LaserSupervision(base), replace(spec, phases=(look, spec.phases[1])))
+    goal = _walk(task, state, 2, fraction=seen, clearance=20.0)
+    assert (goal.phase.tolist(), goal.late.tolist()) == ([1, 1], [int(reason == LATE)] * 2)
+
+
+def test_a_phase_that_goes_on_after_its_time_is_told(tmp_path):
+    """Both phases run out of their time, 0.3 and 0.2 s, and a third has no condition to miss."""
+    text = TINY.replace("timeout_s = 30.0", 'timeout_s = 0.2\non_timeout = "go on"')
+    text = text.replace("time_s = 0.5", "time_s = 2.0").replace("repeats = 3", "repeats = 1")
+    text += '[[phases]]\nname = "rest"\nlaser = "rest"\ntimeout_s = 0.1\non_timeout = "go on"\n'
+    spec = load_experiment(write(tmp_path, text))
+    block = roll_out_block(spec, settings(spec)[0], 0, 1)
+    assert block.rows[0]["outcome"] == "done; cut took too long"
+    told = [(round(e.time_s, 3), e.level, e.text) for e in block.logs[0].events]
+    late = [each for each in told if "time out" in each[2]]
+    assert late == [
+        (0.3, "warning", "time out in phase look: 'centred' not met in 0.3 s"),
+        (0.5, "warning", "time out in phase cut: 'cut' not met in 0.2 s"),
+    ]
+    assert told[-2:] == [
+        (0.6, "info", "all phases done"),
+        (0.6, "warning", "ended without success"),
+    ]
+    assert not any(level == "error" for _, level, _ in told)
 
 
 def test_every_laser_has_to_be_out_and_the_endoscope_need_not():

@@ -26,6 +26,8 @@ from surgisoft.tasks.world.arm import radius_mm
 from surgisoft.tasks.world.respiration import MOVING
 from surgisoft.tasks.world.scene import ObstacleEngine, SceneEngine
 
+EARLY = "ended early"
+"""Event at the end of an episode that ended before its time without success."""
 JUMP_MM = 3.0
 """A target that moves farther than this in one step has jumped: no line is drawn (mm)."""
 
@@ -449,4 +451,4 @@ def _end(log: EpisodeLog, ending: str) -> tuple[str, str]:
     success = log.measures.get("success")
     if success is None or success[-1] > 0.0:
         return "info", "done"
-    return ("warning", "the time has elapsed") if ending == "time out" else ("error", "ended early")
+    return ("warning", "the time has elapsed") if ending == "time out" else ("error", EARLY)

@@ -40,6 +40,15 @@ Function = Callable[[Arrays], list]
 """Input arrays by name in, output arrays in the order of `policy.json` out."""
 
 
+MOST_PERIODS = 10.0
+"""Longest time between two samples of an episode, in control periods. After a longer one the arm
+has moved on without decisions, and the policy would go on as if it had not."""
+BEYOND = 1e-3
+"""By how much a share or a flag may be outside of its range, by rounding."""
+SHARE = "-"
+"""Unit of signals that are shares or flags, whose ranges are hard; distances may be beyond theirs."""
+
+
 class Controller:
     """One robot's controller: keeps the state between samples and checks what comes in."""
 
@@ -140,10 +149,17 @@ class Controller:
 
         A new decision is made once in a control period; in between the last one is returned.
         commanded_kPa: the set points in force where they are not those that were returned last,
-        for example because a safety layer held them back.
+        for example because a safety layer held them back. Raises ValueError after more than
+        `MOST_PERIODS` control periods without a sample.
         """
         if not self._begun:
             raise ValueError("step before begin: call begin(...) with the first sample")
+        longest_s = MOST_PERIODS * self.about["controller"]["control_period_s"]
+        if float(dt_s) > longest_s:
+            raise ValueError(
+                f"dt_s is {float(dt_s):g} s, expected at most {longest_s:g} s within an episode; "
+                "after a longer break bring the arm to its start and call begin(...) again"
+            )
         self._run(pressure_kPa, key_points_mm, commanded_kPa, dt_s, 0.0, signals)
         return self._commands()
 
@@ -175,6 +191,13 @@ class Controller:
             value = np.nan if value is None else float(value)
             if not np.isfinite(value) and not signal["optional"]:
                 raise ValueError(f"signal '{name}' is missing: {signal['meaning']}")
+            low, high = signal["low"], signal["high"]
+            outside = value < low - BEYOND or value > high + BEYOND
+            if outside and signal["unit"] == SHARE:
+                raise ValueError(
+                    f"signal '{name}' is {value:g}, expected {low:g} to {high:g}: "
+                    f"{signal['meaning']}"
+                )
             given[name] = np.array([value], np.float32)
         found = dict(zip(self._names, self._function(given), strict=True))
         self._state = np.asarray(found.pop("next_state"), np.float32)

@@ -247,6 +247,22 @@ def test_the_example_of_the_page_drives_the_controller(ring, monkeypatch):
             np.testing.assert_array_equal(made.state(f"arms.{name}.plant.highest_kPa"), 40.0)
 
 
+def test_signals_and_times_out_of_range_are_refused(ring):
+    """A share of 5 (in per cent, perhaps), and 2 s without a sample, of which one decision came."""
+    policy, task, _ = ring
+    made = running(ControllerGraph(task, policy.actors))
+    points = {name: arm.model.rest_mm.numpy() for name, arm in task.world.arms.items()}
+    rest = {name: np.zeros(3) for name in task.agents}
+    made.begin(rest, points, rest, 30.0, view_fraction=1.0, beam_on=0.0)
+    for wrong in (5.0, -0.1):
+        with pytest.raises(ValueError, match=f"'view_fraction' is {wrong:g}, expected 0 to 1: share"):
+            made.step(rest, points, 0.1, view_fraction=wrong, beam_on=0.0)
+    with pytest.raises(ValueError, match=r"dt_s is 2 s, expected at most 1 s within an episode"):
+        made.step(rest, points, 2.0, view_fraction=1.0, beam_on=0.0)
+    made.step(rest, points, 1.0, view_fraction=1.0, beam_on=1.0)
+    assert made.steps == 1
+
+
 def test_over_a_whole_episode_the_same_measurements_give_the_same_commands(ring):
     """A ring is cut in 140 decisions and more, with noise: the loops would be far apart by then."""
     policy, task, episode = ring

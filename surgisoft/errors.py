@@ -10,6 +10,8 @@ from typing import Any
 
 LONGEST = 1000
 """Characters of a message; of a longer one the middle is left out."""
+ALIKE = 0.65
+"""Least similarity (`difflib`, 0..1) of a known name that a message suggests for an unknown one."""
 SHOWN = 160
 """Most characters of a foreign exception's text in a message."""
 
@@ -99,14 +101,18 @@ def path_of(role: str, given: object, expected: str = "a path") -> Path:
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> InputError:
-    """InputError for a name that a registry lacks; the message lists the known names."""
+    """InputError for a name that a registry lacks; the message lists the known names.
+
+    Names that hold a comma are listed in quotation marks.
+    """
     known = sorted(known)
     if not isinstance(name, str):
         return wrong_type(kind, name, f"the name of one, such as {', '.join(known[:3])}")
     near = [each for each in known if len(name) > 2 and each.startswith(name)]
-    near = near or difflib.get_close_matches(name[:100], known, 1)
+    near = near or difflib.get_close_matches(name[:100], known, 1, ALIKE)
     hint = f"; did you mean '{near[0]}'?" if len(near) == 1 else ""
-    return InputError(f"unknown {kind} '{name}': known are {', '.join(known)}{hint}")
+    shown = [f"'{each}'" for each in known] if any("," in each for each in known) else known
+    return InputError(f"unknown {kind} '{name}': known are {', '.join(shown)}{hint}")
 
 
 def exists_already(path: object) -> InputError:

@@ -2,7 +2,7 @@
 
 import io
 
-from surgisoft.errors import LONGEST, InputError, counted
+from surgisoft.errors import LONGEST, InputError, counted, unknown_name
 
 
 def test_what_a_file_holds_cannot_steer_the_terminal_or_fail_to_be_printed():
@@ -18,6 +18,16 @@ def test_a_long_message_keeps_its_beginning_and_its_end():
     short = str(InputError("a.csv: " + "y" * 2000 + "; expected less"))
     assert len(short) < LONGEST
     assert short.endswith("; expected less")
+
+
+def test_known_names_are_told_apart_and_only_near_ones_are_suggested():
+    views = ["Clearance (mm)", "Endoscope", "Pressures, laser (kPa)"]
+    said = str(unknown_name("view", "nope", views))
+    assert said == (
+        "unknown view 'nope': known are 'Clearance (mm)', 'Endoscope', 'Pressures, laser (kPa)'"
+    )
+    assert str(unknown_name("view", "Endoscpe", views)).endswith("did you mean 'Endoscope'?")
+    assert str(unknown_name("task", "z", ["b1", "a1"])) == "unknown task 'z': known are a1, b1"
 
 
 def test_a_count_agrees_with_its_noun():

@@ -19,6 +19,7 @@ from surgisoft.agents.evaluate import (
     watched_by,
 )
 from surgisoft.agents.exact_checks import ExactChecks
+from surgisoft.agents.learned import check_fits
 from surgisoft.agents.policies import POLICIES, Policy, check_policy, open_policy
 from surgisoft.agents.rollout import BATCH, EpisodeRecorders, rollout
 from surgisoft.agents.run_folder import RunFolder
@@ -177,16 +178,18 @@ class EvaluationRequest:
             raise InputError(f"--task is missing; expected one of {', '.join(task_names())}")
         task = self.task or runs[0].config["task"]
         brought = [run for run in runs if run.config["task"] == task]
-        for run in runs:
-            if run not in brought:
-                on_warning(f"{run.path} was trained on {run.config['task']}, not on {task}")
         config = self.config
         if config is None and brought:
             config = brought[0].plan().task_config
             self._warn_of_fields(brought, on_warning)
         config = task_config(task, config, self.arm, self.scene)
+        made = make_task(task, config)
+        for run in runs:
+            if run not in brought:
+                check_fits(run, made)
+                on_warning(f"{run.path} was trained on {run.config['task']}, not on {task}")
         self._warn_of_scenes(brought, config, on_warning)
-        return make_task(task, config), config
+        return made, config
 
     def _warn_of_scenes(
         self, runs: list[RunFolder], config: Any, on_warning: Callable[[str], None]

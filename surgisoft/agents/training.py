@@ -309,6 +309,8 @@ class Result:
     """Time on a processor of the leading process, s."""
     best: dict[str, float] | None
     """Evaluation of the best checkpoint."""
+    updates: int = 1
+    """Updates of this call: 0 where the plan was done before."""
 
 
 def train_new(
@@ -374,7 +376,7 @@ def _check_saved(run: RunFolder, saved: dict[str, Any], plan: Plan) -> None:
 
 def _continue(run, processes, device, report, logger: str) -> Result:
     training = reopened(run.path, processes, device)
-    plan = training.plan
+    plan, first = training.plan, training.iteration
     log = _Log(run, training.iteration, logger) if processes.leads else None
     written, found = time.monotonic(), training.best
     stopped = reached = False
@@ -398,7 +400,8 @@ def _continue(run, processes, device, report, logger: str) -> Result:
                 written = time.monotonic()
     clock = training.clock
     done = reached or training.share >= 1.0
-    return Result(done, training.steps, clock.wall_s, clock.cpu_s, training.best)
+    updates = training.iteration - first
+    return Result(done, training.steps, clock.wall_s, clock.cpu_s, training.best, updates)
 
 
 def _evaluated(run: RunFolder, training: Training) -> dict[str, float]:

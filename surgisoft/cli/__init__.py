@@ -8,6 +8,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Sequence
+from contextvars import ContextVar
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn
@@ -176,6 +177,19 @@ def command_line() -> Callable[..., Any]:
     return get_command(with_commands())
 
 
+_told: ContextVar[bool] = ContextVar("how an interrupted command was left is told", default=False)
+
+
+def stopped(text: str) -> NoReturn:
+    """End an interrupted command that can be continued: print how it was left, and how to go on.
+
+    Its folder is not named as complete then, see `left_behind`.
+    """
+    print(text)
+    _told.set(True)
+    raise typer.Exit(INTERRUPTED) from None
+
+
 def left_behind(written: Sequence[Path]) -> str:
     """Outputs that an interrupted command leaves, in words: each file is complete or absent."""
     there = [path for path in dict.fromkeys(written) if path.exists()]
@@ -189,6 +203,7 @@ def left_behind(written: Sequence[Path]) -> str:
 
 def run(arguments: list[str] | None = None) -> int:
     """Run one command and return the exit code: 0, 2 for bad input, 130 after Ctrl-C."""
+    _told.set(False)
     with noted_writes() as written, warnings.catch_warnings():
         warnings.showwarning = functools.partial(_show, warnings.showwarning, set())
         return _run(arguments, written)
@@ -234,7 +249,7 @@ def _run(arguments: list[str] | None, written: list[Path]) -> int:
         return 0
     except OSError as error:
         return _fail(f"{error.filename or 'file system'}: {error.strerror or error}")
-    if code == INTERRUPTED:  # typer turns a KeyboardInterrupt into this code
+    if code == INTERRUPTED and not _told.get():  # typer turns a KeyboardInterrupt into this code
         print(f"surgisoft: interrupted; {left_behind(written)}", file=sys.stderr)
     return code if isinstance(code, int) else 0
 

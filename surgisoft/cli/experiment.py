@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from surgisoft.cli import INTERRUPTED, app
+from surgisoft.cli import app, stopped
 from surgisoft.cli.files import check_folder, show_written
 from surgisoft.cli.inputs import read_context, warn
 from surgisoft.cli.options import (
@@ -115,8 +115,7 @@ def run(
             }  # fmt: skip
             again = f"surgisoft experiment run {typed(file)} -o {typed(folder)} --resume"
             again = with_effect_files(again + given_options(given))
-            print(f"stopped; {folder} keeps the finished blocks; continue with: {again}")
-            raise typer.Exit(INTERRUPTED) from None
+            stopped(f"stopped; {folder} keeps the finished blocks; continue with: {again}")
     if context is not None:
         from surgisoft.credibility.of_experiment import assess_experiment
         from surgisoft.credibility.page import write_report
@@ -156,9 +155,10 @@ def check(
     )
     for phase in spec.phases:
         beam = ", beam" if phase.beam else ""
-        within = spec.of.experiment.conditions[phase.until].within
-        within = within if phase.within < 0.0 else phase.within
-        until = "never" if phase.until == "never" else f"{phase.until} ({within:g})"
+        condition = spec.of.experiment.conditions[phase.until]
+        within = condition.within if phase.within < 0.0 else phase.within
+        threshold = condition.scenes if within == 0.0 and condition.scenes else f"{within:g}"
+        until = "never" if phase.until == "never" else f"{phase.until} ({threshold})"
         print(
             f"  phase {phase.name}: {', '.join(map(' '.join, phase.arms))}{beam}; "
             f"until {until}, at most {phase.timeout_s:g} s, then {phase.on_timeout}"

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from surgisoft.cli import INTERRUPTED, app
+from surgisoft.cli import app, stopped
 from surgisoft.cli.inputs import warn
 from surgisoft.cli.options import (
     SEED_MAX,
@@ -221,11 +221,10 @@ def train(
     if not run.leads:
         return
     if not run.result.done:
-        print(
+        stopped(
             f"stopped after {run.result.steps:,} steps; continue with: "
             f"{with_effect_files(f'surgisoft train --resume {typed(run.folder)}')}"
         )
-        raise typer.Exit(INTERRUPTED)
     print(_summary(run.folder, run.result))
     if why := shortfall(run):
         warn(why)
@@ -246,6 +245,11 @@ def _measures(found: dict | None) -> str:
 
 
 def _summary(folder: Path, result) -> str:
+    if not result.updates:
+        return (
+            f"{folder} was finished before, and nothing was trained: {result.steps:,} steps, best "
+            f"{_measures(result.best)}"
+        )
     return (
         f"wrote {folder}: {result.steps:,} steps in {result.wall_s:.0f} s "
         f"({result.cpu_s:.0f} s of processor), best {_measures(result.best)}"

@@ -13,7 +13,7 @@ from surgisoft.agents.on_rig import rigs_by_arm
 from surgisoft.agents.policies import Policy
 from surgisoft.agents.run_folder import RunFolder
 from surgisoft.config import read_toml
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, unknown_name
 from surgisoft.experiments.controllers import PhaseControllers
 from surgisoft.experiments.page import experiment_page, markdown, shown_episodes
 from surgisoft.experiments.phases import PhasedTask
@@ -42,11 +42,19 @@ REPLAY_PICTURES_HZ = 1.0
 def find_experiment(name: str | Path) -> Path:
     """The file of an experiment, by its path or by the name of a packaged one (`liver`).
 
-    A folder of that name, a scene's perhaps, is no experiment and hides none.
+    A folder of that name, a scene's perhaps, is no experiment and hides none. Raises InputError for
+    a word that is the name of no packaged one, and of nothing else.
     """
     path = Path(name)
-    named = PACKAGED / f"{path.name}.toml"
-    return named if len(path.parts) == 1 and not path.is_file() and named.is_file() else path
+    if len(path.parts) != 1 or path.is_file():
+        return path
+    packaged = {file.stem: file for file in PACKAGED.glob("*.toml")}
+    if path.name in packaged:
+        return packaged[path.name]
+    if not path.suffix and not path.exists():
+        unknown = unknown_name("experiment", path.name, packaged)
+        raise InputError(f"{unknown}; or give the path of a TOML file")
+    return path
 
 
 def experiments_of(folder: str | Path | None = None) -> list[Path]:

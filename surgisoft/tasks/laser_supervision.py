@@ -93,7 +93,13 @@ HOW = (
 LASER_EXPERIMENT = ExperimentTask(
     conditions={
         "centred": Condition("optical axis this near to the lesion (mm), in sight", 1.0, _centred),
-        "seen": Condition("this share of what is to be seen is seen (0..1)", 0.0, _seen, 1.0),
+        "seen": Condition(
+            "this share of what is to be seen is seen (0..1)",
+            0.0,
+            _seen,
+            1.0,
+            "view_fraction of the scene",
+        ),
         "aimed": Condition("beam's axis this near to its target (mm)", 0.5, _aimed),
         "cut": Condition("this share of the ring is cut (0..1)", 1.0, completed, 1.0),
         "retracted": Condition("laser arm's chambers this near to rest (kPa)", 1.0, _retracted),

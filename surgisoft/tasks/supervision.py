@@ -35,6 +35,8 @@ class Condition:
     """(task, state, within) -> (B,) bool; the task as it was built, without phases."""
     most: float = math.inf
     """Largest threshold that makes sense, in its unit: 1 for a share."""
+    scenes: str = ""
+    """Limit of the scene that holds in place of a threshold of 0; empty: 0 is 0."""
 
 
 class Supervision(Protocol):

@@ -18,19 +18,20 @@ from surgisoft.agents.controller_runner import Controller
 from surgisoft.agents.distributed import processes
 from surgisoft.agents.exact_checks import ExactChecks
 from surgisoft.agents.export import export
-from surgisoft.agents.learned import check_fits
+from surgisoft.agents.learned import agent_sizes, check_fits
 from surgisoft.agents.loggers import LoggerFailed, check_logger, open_writer
 from surgisoft.agents.observer import ObserverGains
 from surgisoft.agents.on_rig import RigConfig, on_rig
 from surgisoft.agents.policies import check_policy
 from surgisoft.agents.presets import Plan, Preset
-from surgisoft.agents.run_folder import PACKAGED, RunFolder, check_free
+from surgisoft.agents.run_folder import PACKAGED, RunFolder, check_free, create_run
 from surgisoft.agents.session import EvaluationRequest, evaluate
 from surgisoft.agents.training import Result
-from surgisoft.agents.training_request import TrainedRun, shortfall, train
+from surgisoft.agents.training_request import TrainedRun, TrainingRequest, shortfall, train
 from surgisoft.errors import InputError
 from surgisoft.tasks.circle_ablation import CircleAblation
 from surgisoft.tasks.path_following import FollowConfig
+from surgisoft.tasks.registry import make_task
 from surgisoft.tasks.track import TrackConfig, track_circle
 from tests.rig.own_rig import OwnRig
 
@@ -302,6 +303,7 @@ def about(arms=("one",), signals=()) -> dict:
 
 def test_the_runner_names_what_a_measurement_lacks(tmp_path):
     phase = {"name": "phase", "default": None, "optional": False, "meaning": "phase of breathing"}
+    phase |= {"unit": "-", "low": 0.0, "high": 1.0}
     (tmp_path / "policy.json").write_text(json.dumps({"controller": None, "note": "it branches"}))
     with pytest.raises(ValueError, match=r"policy\.json: has no controller, it branches"):
         Controller(tmp_path)
@@ -318,6 +320,7 @@ def test_the_runner_names_what_a_measurement_lacks(tmp_path):
         (rest, both, float("nan"), {"phase": 0.1}, "dt_s is nan, expected 0 s or more"),
         (rest, both, 0.1, {"phse": 0.1}, "signal 'phse' is not known, expected phase"),
         (rest, both, 0.1, {}, "signal 'phase' is missing: phase of breathing"),
+        (rest, both, 0.1, {"phase": 2.0}, "signal 'phase' is 2, expected 0 to 1: phase of breath"),
         ({"one": [0.0, 0.0]}, both, 0.1, {}, "pressure_kPa: arm 'two' is missing, got one"),
         (rest, points, 0.1, {}, "key_points_mm: expected a dict with the arms one, two"),
     ):
@@ -347,9 +350,20 @@ def test_a_device_that_is_not_there_is_one_line():
             pass
 
 
-def test_a_run_of_another_task_is_told_of(packaged):
+def test_a_run_of_other_agents_is_one_error_and_no_warning():
     told: list[str] = []
-    request = EvaluationRequest((packaged,), "track_circle", config=SHORT)
+    with pytest.raises(InputError, match="with agents laser, endoscope; task 'track_circle' has arm"):
+        EvaluationRequest(("ring",), "track_circle", config=SHORT).resolved(told.append)
+    assert not told
+
+
+def test_a_run_of_another_task_is_told_of(tmp_path):
+    """Of one with the same agents, observations and actions, which can act here."""
+    plan = TrainingRequest("track_square").plan()
+    square = make_task("track_square")
+    create_run(tmp_path / "run", plan, square, agent_sizes(square), 1)
+    told: list[str] = []
+    request = EvaluationRequest((str(tmp_path / "run"),), "track_circle")
     task, _ = request.resolved(told.append)
     assert task.name == "track_circle"
     assert len(told) == 1

@@ -245,7 +245,8 @@ def same(one, other):
 
 def test_a_finished_run_stays_as_it_is(run):
     before = weights(run)
-    assert resume(run.path, Processes(), CPU).done
+    found = resume(run.path, Processes(), CPU)
+    assert (found.done, found.updates) == (True, 0)
     assert_equal(before, weights(run))
 
 

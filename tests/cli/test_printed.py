@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from surgisoft.agents.rig_check import Differences, RigCheck
+from surgisoft.agents.training import Result
 from surgisoft.cli import run
 from surgisoft.cli.diagnose import announced
 from surgisoft.cli.fit import above_noise
@@ -357,8 +358,8 @@ def test_amend_and_improve_write_nothing_where_nothing_is_claimed(
 
 
 def test_train_says_how_to_go_on(tmp_path, capsys, monkeypatch):
-    def run_of(best, done=True, leads=True):
-        numbers = SimpleNamespace(done=done, steps=1500, wall_s=60.0, cpu_s=50.0, best=best)
+    def run_of(best, done=True, leads=True, updates=3):
+        numbers = Result(done, 1500, 60.0, 50.0, best, updates)
         return SimpleNamespace(leads=leads, result=numbers, folder=Path("runs/x"))
 
     target = "surgisoft.agents.training_request.train"
@@ -367,6 +368,10 @@ def test_train_says_how_to_go_on(tmp_path, capsys, monkeypatch):
     assert printed(capsys, monkeypatch, target, run_of(None, leads=False), *command) == ""
     out = printed(capsys, monkeypatch, target, run_of(None, done=False), *command, code=130)
     assert out == "stopped after 1,500 steps; continue with: surgisoft train --resume runs/x\n"
+    idle = run_of({"error_mm": 0.25}, updates=0)
+    out = printed(capsys, monkeypatch, target, idle, "train", "--resume", "runs/x")
+    assert "runs/x was finished before, and nothing was trained: 1,500 steps, best eval" in out
+    assert "wrote" not in out
     for best, said in (
         (None, "best not evaluated yet"),
         ({"success": 0.5}, "best evaluation: success 50%\n"),

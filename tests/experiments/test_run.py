@@ -141,6 +141,18 @@ def test_an_experiment_of_which_every_setting_fails_says_so_in_one_line(
     assert not (tmp_path / "r" / "report.html").exists()
 
 
+def test_an_interrupted_command_does_not_call_its_folder_complete(tmp_path, monkeypatch, capsys):
+    def interrupt(*given):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(experiment_run, "roll_out_block", interrupt)
+    file, folder = write(tmp_path), tmp_path / "r"
+    assert run(["experiment", "run", str(file), "-o", str(folder)]) == 130
+    printed = capsys.readouterr()
+    assert f"{folder} keeps the finished blocks; continue with: surgisoft exp" in printed.out
+    assert "complete" not in printed.err
+
+
 def test_an_interrupted_run_goes_on_where_it_stopped(whole, tmp_path):
     file, folder = whole
     spec, began = load_experiment(file), []

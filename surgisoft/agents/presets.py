@@ -243,6 +243,14 @@ class Plan:
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise InputError(f"train: {name} is {value}, expected more than 0")
 
+    def whole_steps(self, processes: int = 1) -> int | None:
+        """Steps that are trained: those of the plan, rounded up to whole updates of all processes;
+        None where the time decides."""
+        if self.steps is None:
+            return None
+        update = self.preset.envs * self.preset.rollout * processes
+        return -(-self.steps // update) * update
+
     def share(self, steps: int, seconds: float) -> float:
         """Share 0..1 of the training that is done."""
         done = [0.0]

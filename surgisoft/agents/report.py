@@ -34,8 +34,12 @@ def evaluation_page(
     logs: Mapping[str, EpisodeLog],
     about: str,
     films: Mapping[str, Picture] | None = None,
+    curves: Sequence[Picture] = (),
 ) -> Page:
-    """HTML page of an evaluation; logs: policy -> its first episode, films: its endoscope's."""
+    """HTML page of an evaluation; logs: policy -> its first episode, films: its endoscope's.
+
+    curves: learning curves of the policies that were trained, see `learning_curves`.
+    """
     films = films or {}
     names = list(dict.fromkeys(name for result in results for name in result.overall))
     rows = [
@@ -54,6 +58,7 @@ def evaluation_page(
             Facts(_facts(best)),
             Section("All numbers", [Table(header, rows)]),
             *([Section("Every episode", [Gallery(_spreads(results))])] if several else []),
+            *([Section("Learning curves", [Gallery(curves)])] if curves else []),
             *(
                 Section(
                     f"First episode of {Path(name).name}",

@@ -161,12 +161,17 @@ def evaluate(
         with progress("replay") as report_progress:
             written.append(write_replay(found.logs[name], path, report=report_progress))
     if report:
+        from surgisoft.agents.learning_curves import learning_curves
+        from surgisoft.agents.policies import POLICIES
         from surgisoft.agents.report import evaluation_page
         from surgisoft.experiments.pictures import film
         from surgisoft.report import write_page
 
         films = {name: film(log) for name, log in found.logs.items() if log.camera is not None}
-        page = evaluation_page(found.task, on, list(found.results), found.logs, about, films)
+        runs = [result.policy for result in found.results if result.policy not in POLICIES]
+        curves = learning_curves(runs)
+        given = found.task, on, list(found.results), found.logs, about, films, curves
+        page = evaluation_page(*given)
         written.append(write_page(page, report / "report.html"))
     print(f"{found.task}, {on}: {about}; mean [95 % interval]")
     _show(found.results)

@@ -28,6 +28,10 @@ OPTIONS = {
 """Options that may be given as FIELD=VALUE, and the types of their values."""
 
 
+LARGEST_ROUNDING = 0.01
+"""Share by which --steps may be rounded up to whole updates without a line that says so."""
+
+
 def _complete(context: typer.Context, incomplete: str) -> list[str]:
     """Fields that begin so, of the task that the line names so far."""
     from surgisoft.agents.presets import Preset
@@ -74,8 +78,10 @@ def _assigned(changes: list[str], task: str | None, given: dict) -> str | None:
 
 
 def _show_plan(plan) -> None:
-    """Print what differs from the task's defaults and from the preset's hyper-parameters, and warn
-    of a scene whose beams pass its own limits or are too weak."""
+    """Print what differs from the task's defaults and from the preset's hyper-parameters, and the
+    steps that whole updates take, and warn of a scene whose beams pass its own limits or are too
+    weak."""
+    from surgisoft.agents.distributed import process_count
     from surgisoft.agents.presets import preset_for
     from surgisoft.agents.session import beam_beyond_limits_of
     from surgisoft.config import differences
@@ -88,6 +94,14 @@ def _show_plan(plan) -> None:
         return
     if lines:
         print("changed from the default:", *lines, sep="\n  ", flush=True)
+    total = plan.whole_steps(process_count())
+    if total is not None and total > (1.0 + LARGEST_ROUNDING) * plan.steps:
+        print(
+            f"{plan.steps:,} steps are rounded up to {total:,}: an update takes "
+            f"{plan.preset.rollout} steps of each of {plan.preset.envs:,} episodes"
+            + (f" in {process_count()} processes" if process_count() > 1 else ""),
+            flush=True,
+        )
     if beyond := beam_beyond_limits_of(plan.task_config):
         warn(beyond)
     if getattr(plan.task_config, "scene", None) is not None:

@@ -1,14 +1,19 @@
 """The page of an evaluation, and what its charts say of logs whose truth is known."""
 
+import json
 import math
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from surgisoft.agents import learning_curves as curves_of
 from surgisoft.agents.evaluate import Summary
+from surgisoft.agents.learning_curves import learning_curves, metrics_of
 from surgisoft.agents.report import in_words, verdict
 from surgisoft.agents.report_charts import broken_at_jumps, path_plane
+from surgisoft.agents.run_folder import RunFolder
 from surgisoft.cli import run
 from tests.report.browser import chromium, look
 
@@ -43,6 +48,56 @@ def test_evaluate_writes_one_self_contained_page(tmp_path, capsys):
         for width in (1280, 400):
             overflow, foreign, broken, _ = look(browser, tmp_path / "r" / "report.html", width)
             assert (overflow, foreign, broken) == (0, [], 0)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Two short trainings that are two evaluations long, of other seeds."""
+    folder = tmp_path_factory.mktemp("runs")
+    for seed in (1, 2):
+        options = f"--steps 768 --envs 32 --seed {seed} ppo.evaluation_episodes=2"
+        options += f" ppo.evaluate_every=1 -o {folder / f'seed{seed}'}"
+        assert run(["train", "--task", "track_circle", *options.split()]) == 0
+    return [folder / "seed1", folder / "seed2"]
+
+
+def test_learning_curves_of_several_runs_are_compared(runs, tmp_path, monkeypatch):
+    """Each line against the numbers of the run's own log."""
+    drawn = []
+
+    def keep(figure, alt, caption=""):
+        drawn.append((figure, alt))
+        return plain(figure, alt, caption)
+
+    plain = curves_of.chart
+    monkeypatch.setattr(curves_of, "chart", keep)
+    names = [str(each) for each in runs]
+    assert run(["evaluate", *names, "--episodes", "1", "--report", str(tmp_path / "r")]) == 0
+    text = (tmp_path / "r" / "report.html").read_text()
+    assert "Learning curves" in text
+    assert [alt for _, alt in drawn] == [
+        "learning curve: reward of a step",
+        "learning curve: error in evaluations [mm]",
+    ], "the task has no success"
+    for (figure, _), number in zip(drawn, ("reward/arm", "evaluation/error_mm"), strict=True):
+        for line, folder in zip(figure.axes[0].lines, runs, strict=True):
+            rows = [json.loads(row) for row in (folder / "metrics.jsonl").read_text().splitlines()]
+            assert line.get_label() == folder.name
+            assert list(line.get_xdata()) == [384.0, 768.0]
+            np.testing.assert_allclose(line.get_ydata(), [row[number] for row in rows])
+
+
+def test_a_damaged_log_costs_its_damaged_lines_only(runs, tmp_path):
+    shutil.copytree(runs[0], tmp_path / "run")
+    file = tmp_path / "run" / "metrics.jsonl"
+    whole = metrics_of(RunFolder(tmp_path / "run"))
+    assert [row["steps"] for row in whole] == [384.0, 768.0]
+    broken = '[1]\n{"steps": "a"}\n{"steps": 1' + "0" * 400 + '}\n{"ste\n\x00' + "[" * 10**5 + "\n"
+    file.write_text(broken + file.read_text())
+    assert metrics_of(RunFolder(tmp_path / "run")) == whole
+    file.unlink()
+    assert metrics_of(RunFolder(tmp_path / "run")) == []
+    assert learning_curves([tmp_path / "run"]) == []
 
 
 @pytest.mark.parametrize(

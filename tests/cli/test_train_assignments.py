@@ -99,6 +99,19 @@ def test_a_wrong_assignment_is_one_line(words, said, tmp_path, monkeypatch, caps
     assert not list(tmp_path.iterdir())
 
 
+def test_steps_that_are_rounded_up_to_whole_updates_are_told(tmp_path, monkeypatch, capsys):
+    """An update takes 32 x 12 steps: 10 become 384, and 384 stay."""
+    monkeypatch.chdir(tmp_path)
+    short = "--task track_circle --envs 32 ppo.evaluation_episodes=2 ppo.batches=2"
+    line = "10 steps are rounded up to 384: an update takes 12 steps of each of 32 episodes"
+    for steps, told in ((10, True), (384, False)):
+        assert run(["train", *short.split(), "--steps", str(steps), "-o", f"r{steps}"]) == 0
+        printed = capsys.readouterr().out
+        assert (line in printed) == told
+        assert ("rounded" in printed) == told
+        assert f"wrote r{steps}: 384 steps in" in printed
+
+
 def test_success_decides_how_far_a_training_came(tmp_path):
     def trained(best):
         return TrainedRun(tmp_path, Result(True, 10, 1.0, 1.0, best), True)

@@ -113,9 +113,18 @@ class JointEnv:
 
 
 class OneAgentEnv(VecEnv):
-    """rsl-rl's VecEnv for a task of one agent: groups NAME (the agent's) and `STATE`."""
+    """rsl-rl's VecEnv for a task of one agent: groups NAME (the agent's) and `STATE`.
+
+    `obs_groups` of a runner is then {"actor": [NAME], "critic": ["state"]}; docs/training.md has an
+    example.
+    """
 
     def __init__(self, task: Task, count: int, seed: int = 0, action_kPa: float = 1.0):
+        """Episodes 0 to `count - 1` of a seed, each at another point of its time.
+
+        action_kPa: change of the commanded pressure for an action of 1, kPa. The pumps limit it, see
+        `Pneumatics.step_kPa`. Raises InputError for a task of several agents.
+        """
         if len(task.agents) != 1:
             raise InputError(
                 f"task '{task.name}' has agents {', '.join(task.agents)}, expected one; "

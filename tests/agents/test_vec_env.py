@@ -2,7 +2,9 @@
 
 import copy
 import math
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -38,6 +40,22 @@ def test_the_runner_of_rsl_rl_trains_it(task):
     runner.learn(2, init_at_random_ep_len=True)
     pairs = zip(before, runner.alg.actor.parameters(), strict=True)
     assert not all(torch.equal(one, other) for one, other in pairs)
+
+
+def test_the_example_of_the_page_trains(tmp_path, monkeypatch):
+    """The block of docs/training.md as it stands: two updates, of 64 episodes and 12 steps each."""
+    page = (Path(__file__).parents[2] / "docs" / "training.md").read_text()
+    (block,) = re.findall(r"^```python\n(from rsl_rl.*?)^```", page, re.S | re.M)
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec(block, names)
+    env, runner = names["env"], names["runner"]
+    groups = {name for group in names["settings"]["obs_groups"].values() for name in group}
+    assert groups == set(env.get_observations().keys())
+    assert runner.logger.tot_timesteps == 2 * 12 * 64
+    assert (tmp_path / "runs" / "rsl" / "model_1.pt").is_file()
+    assert names["actions"].shape == (64, 3)
+    assert names["actions"].isfinite().all()
 
 
 def test_actions_are_shares_and_episodes_are_the_tasks_own(task):

@@ -46,7 +46,7 @@ has moved on without decisions, and the policy would go on as if it had not."""
 BEYOND = 1e-3
 """By how much a share or a flag may be outside of its range, by rounding."""
 SHARE = "-"
-"""Unit of signals that are shares or flags, whose ranges are hard; distances may be beyond theirs."""
+"""Unit of shares and flags, whose ranges are hard; distances may be beyond theirs."""
 
 
 class Controller:

@@ -109,7 +109,8 @@ class GraphedRollout:
         finite."""
         for agent, ppo in self.agents.items():
             ppo.compute_returns(self._views[agent])
-        assert self._notes is not None and self.latest is not None
+        assert self._notes is not None
+        assert self.latest is not None
         every = self._notes.transpose(0, 1).flatten(1)
         known = every.isfinite()
         # By slices: a graph cannot copy a list of names. Measures stand between terms and `done`.

@@ -50,8 +50,9 @@ def metrics_of(run: RunFolder) -> list[dict[str, float]]:
 
 def _is_number(value: object) -> bool:
     """Whether a value is a finite number that a float can hold."""
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    return number and abs(value) < sys.float_info.max
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return abs(value) < sys.float_info.max
 
 
 def learning_curves(runs: Sequence[str | Path]) -> list[Picture]:

@@ -212,5 +212,7 @@ def collect_rollout(env: JointEnv, agents: dict[str, PPO], seen: TensorDict, ste
 def _mean(values: list[Tensor], name: str) -> float:
     """Mean of (T, B) values; of a measure that of its finite ones, nan where nothing is."""
     every = torch.stack(values).float()
-    known = every.isfinite() if name.startswith(MEASURE) else torch.ones_like(every, dtype=bool)
+    known = (
+        every.isfinite() if name.startswith(MEASURE) else torch.ones_like(every, dtype=torch.bool)
+    )
     return (every.where(known, 0.0).sum() / known.sum()).item()

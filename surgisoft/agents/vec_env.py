@@ -122,8 +122,8 @@ class OneAgentEnv(VecEnv):
     def __init__(self, task: Task, count: int, seed: int = 0, action_kPa: float = 1.0):
         """Episodes 0 to `count - 1` of a seed, each at another point of its time.
 
-        action_kPa: change of the commanded pressure for an action of 1, kPa. The pumps limit it, see
-        `Pneumatics.step_kPa`. Raises InputError for a task of several agents.
+        action_kPa: change of the commanded pressure for an action of 1, kPa; `Pneumatics.step_kPa`
+        limits it. Raises InputError for a task of several agents.
         """
         if len(task.agents) != 1:
             raise InputError(

@@ -43,8 +43,8 @@ class PhaseState:
     where: Tensor
     """(B,) int64: phase of the abort."""
     late: Tensor
-    """(B,) int64: one more than the number of the last phase whose time was out before its condition
-    held, and after which the next one followed; 0: none."""
+    """(B,) int64: one more than the number of the last phase that took too long and was followed by
+    the next one; 0: none."""
 
 
 class PhasedTask:

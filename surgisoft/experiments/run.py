@@ -418,9 +418,7 @@ def failures(spec: Experiment, folder: Path) -> list[Failure]:
 def failed_words(failed: list[Failure]) -> str:
     """The first failure, how many more there are, and what to do, in one line."""
     more = f" (and {counted(len(failed) - 1, 'further block')})" if len(failed) > 1 else ""
-    return (
-        f"{failed[0].text}{more}; the traceback is in {failed[0].file}; continue with --resume"
-    )
+    return f"{failed[0].text}{more}; the traceback is in {failed[0].file}; continue with --resume"
 
 
 def read_rows(folder: Path, every: list[Job]) -> list[Row]:

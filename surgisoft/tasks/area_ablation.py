@@ -2,8 +2,8 @@
 
 The laser, defocused to a wider spot, follows a raster over the inside of each outline; a policy may
 leave it by as much as `fire_mm`. At the end of the raster the reference begins it again, until the
-lesion is treated or the time is out: the measure `passes` counts them. The result is the dose map: which share of the lesion has the dose
-and how much healthy tissue was ablated.
+lesion is treated or the time is out: the measure `passes` counts them. The result is the dose map:
+which share of the lesion has the dose and how much healthy tissue was ablated.
 """
 
 from __future__ import annotations
@@ -84,8 +84,8 @@ class AreaAblationConfig(LaserConfig):
     spot_mm: float = 2.0
     """Diameter of the defocused beam on the tissue at 1/e^2, mm."""
     pitch_mm: float = 1.2
-    """Distance of neighbouring lines of the raster, mm. Where they leave gaps, further passes burn the
-    same lines again."""
+    """Distance of neighbouring lines of the raster, mm. Where they leave gaps, further passes burn
+    the same lines again."""
     overrun_mm: float = 0.5
     """Distance by which the raster reaches beyond the outline, so that its edge has the dose, mm.
     """

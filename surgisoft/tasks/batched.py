@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surgisoft.errors import InputError
 from surgisoft.memory import keep_freed_memory
 from surgisoft.tasks.arguments import actions_of, check_agents, whole
 from surgisoft.tasks.base import Task, TaskState, check_finite

@@ -185,8 +185,8 @@ def parallel_env(
     the commanded pressure, kPa, both float32. Raises InputError for an unknown task, scene or
     field.
 
-    task: its name, or a task that is built already, which the arguments from config to image_pixels
-    do not change. config: the task's whole config, None: its default one. scene: a scene's folder. arm: an arm
+    task: its name, or a task that is built already, which takes no config, scene, arm or images.
+    config: the task's whole config, None: its default one. scene: a scene's folder. arm: an arm
     model's folder or `default`. None leaves scene or arm as the config has it. geometry: `fcl`, the
     exact collision checker, or `batched`, the faster engine of training, for contact and for the
     beam's hit; near contact the two agree to 0.1 mm. render_mode: `rgb_array`, for pictures by

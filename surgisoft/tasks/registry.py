@@ -214,8 +214,8 @@ def task_of(task: str | Task, device: str | torch.device = "cpu", **changes: Any
     beside = [name for name in changes if name != "geometry" and changes[name] is not None]
     if beside:
         raise InputError(
-            f"{beside[0]} is given beside the task '{task.name}', which is built already; build the "
-            f"task with it, or name the task"
+            f"{beside[0]} is given beside the task '{task.name}', which is built already; build "
+            "the task with it, or name the task"
         )
     return task
 

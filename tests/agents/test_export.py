@@ -255,7 +255,7 @@ def test_signals_and_times_out_of_range_are_refused(ring):
     rest = {name: np.zeros(3) for name in task.agents}
     made.begin(rest, points, rest, 30.0, view_fraction=1.0, beam_on=0.0)
     for wrong in (5.0, -0.1):
-        with pytest.raises(ValueError, match=f"'view_fraction' is {wrong:g}, expected 0 to 1: share"):
+        with pytest.raises(ValueError, match=f"'view_fraction' is {wrong:g}, expected 0 to 1: "):
             made.step(rest, points, 0.1, view_fraction=wrong, beam_on=0.0)
     with pytest.raises(ValueError, match=r"dt_s is 2 s, expected at most 1 s within an episode"):
         made.step(rest, points, 2.0, view_fraction=1.0, beam_on=0.0)

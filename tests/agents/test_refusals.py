@@ -352,7 +352,7 @@ def test_a_device_that_is_not_there_is_one_line():
 
 def test_a_run_of_other_agents_is_one_error_and_no_warning():
     told: list[str] = []
-    with pytest.raises(InputError, match="with agents laser, endoscope; task 'track_circle' has arm"):
+    with pytest.raises(InputError, match="agents laser, endoscope; task 'track_circle' has arm"):
         EvaluationRequest(("ring",), "track_circle", config=SHORT).resolved(told.append)
     assert not told
 

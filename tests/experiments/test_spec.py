@@ -365,7 +365,10 @@ def test_check_names_the_limit_of_clearance_that_holds(tmp_path, capsys):
 def test_check_says_whose_threshold_of_sight_it_is(tmp_path, capsys):
     """0, the default, is below the scene's view_fraction, which holds."""
     seen = TINY.replace('until = "centred"', 'until = "seen"')
-    for given, said in (("", "seen (view_fraction of the scene)"), ("within = 0.5\n", "seen (0.5)")):
+    for given, said in (
+        ("", "seen (view_fraction of the scene)"),
+        ("within = 0.5\n", "seen (0.5)"),
+    ):
         path = write(tmp_path, seen.replace('until = "seen"', f'until = "seen"\n{given}'))
         assert run(["experiment", "check", str(path)]) == 0
         assert f"until {said}, at most 0.3 s" in capsys.readouterr().out
@@ -375,7 +378,9 @@ def test_a_folder_of_that_name_does_not_hide_a_packaged_experiment(tmp_path, mon
     (tmp_path / "liver").mkdir()
     monkeypatch.chdir(tmp_path)
     assert find_experiment("liver") == PHANTOM / "experiments" / "liver.toml"
-    with pytest.raises(InputError, match=r"'livr': known are area, .*did you mean 'liver'\?; or gi"):
+    with pytest.raises(
+        InputError, match=r"'livr': known are area, .*did you mean 'liver'\?; or gi"
+    ):
         find_experiment("livr")
     (tmp_path / "fault").touch()
     assert find_experiment("fault") == Path("fault"), "a file is meant"

@@ -84,7 +84,10 @@ def of_rewards(rewards):
 
 WRONG_REWARDS = [
     (lambda state: {"arm": {"x": 1.0}}, "term 'x' of 'arm' is of type float, expected a tensor of"),
-    (lambda state: {"arm": {"x": torch.ones(3)}}, r"'x' of 'arm' is of shape \(3,\), .* \(2,\), one"),
+    (
+        lambda state: {"arm": {"x": torch.ones(3)}},
+        r"'x' of 'arm' is of shape \(3,\), .* \(2,\), one",
+    ),
     (lambda state: {"arm": torch.ones(2)}, "for 'arm' are of type Tensor, expected a dict of at l"),
     (lambda state: {"arm": {}}, "for 'arm' are an empty dict, expected a dict of at least one"),
     (lambda state: {"bob": {"x": torch.ones(2)}}, "are of bob, expected a dict of arm"),

@@ -23,7 +23,7 @@ from surgisoft.experiments import run as experiment_run
 from surgisoft.experiments import spec as experiment_spec
 from surgisoft.experiments.page import rules
 from surgisoft.experiments.plan import build_task, settings
-from surgisoft.experiments.results import sum_up
+from surgisoft.experiments.results import drop_logs, sum_up
 from surgisoft.experiments.run import open_results, run_experiment
 from surgisoft.experiments.session import ExperimentRules, with_policy
 from surgisoft.experiments.spec import Case, load_experiment
@@ -125,6 +125,28 @@ def test_a_setting_whose_code_raises_leaves_the_others_their_report(tmp_path, mo
     assert run([*command, "--resume"]) == 0
     assert len(json.loads((folder / "summary.json").read_text())["settings"]) == 3
     assert not list((folder / "failures").iterdir())
+
+
+def test_a_setting_of_which_a_block_fails_is_left_out_whole(tmp_path, monkeypatch):
+    """Two blocks of one episode each; the second one of the first setting raises."""
+    text = TINY.replace("repeats = 3", "repeats = 2") + THREE_TIMES
+    spec, folder = load_experiment(write(tmp_path, text)), tmp_path / "r"
+    play = experiment_run.roll_out_block
+
+    def played(spec, setting, first, *given):
+        if (setting.label, first) == ("simulation_cut_s=30", 1):
+            raise ArithmeticError("a singular matrix")
+        return play(spec, setting, first, *given)
+
+    monkeypatch.setattr(experiment_run, "roll_out_block", played)
+    open_results(spec, folder)
+    rows = run_experiment(spec, folder)
+    assert {row["setting"] for row in rows} == {"simulation_cut_s=40", "simulation_cut_s=50"}
+    results = sum_up(spec, folder, rows)
+    (failed,) = results.failed
+    assert failed.text.startswith("setting 'simulation_cut_s=30', episode 1: raised ArithmeticErr")
+    drop_logs(results)
+    assert len(results.log("simulation_cut_s=30", 0).time_s), "kept for the run that goes on"
 
 
 def test_an_experiment_of_which_every_setting_fails_says_so_in_one_line(

@@ -123,6 +123,10 @@ LAG_SHARES = (0.0, 0.25)
 """Pure parts of the mixtures of a delay and a lag that a pure delay is compared with."""
 LAG_STRETCHES = (0.7, 1.0, 1.3)
 """Time constants of their lags, in units of what is left of the delay."""
+HIDDEN_LAGS_S = tuple(float(tau) for tau in np.geomspace(0.01, 1.0, 21).round(3))
+"""Lags that are tried in the place of a part of an offset in time, s."""
+HIDDEN_SHARES = (0.7, 0.85, 1.0)
+"""Delays that are taken off the offset for such a lag, in units of its time constant."""
 LAG_MARGIN = 3.0
 """Rows that take no part at the begin of each run, in units of the delay."""
 MOST_EQUALS = 3
@@ -204,6 +208,12 @@ class Fitted:
     """Held-out RMS error, mm."""
     later_sd_s: float = 0.0
     """Standard error of the offset in time, s."""
+    hidden_lag_s: float = 0.0
+    """Largest lag that does as well in the place of a part of the offset in time, s."""
+    likelier_lag_s: float = 0.0
+    """The lag in the place of a part of it that does clearly better; 0: none, s."""
+    likelier_later_s: float = 0.0
+    """The offset in time beside that lag, s."""
 
     @property
     def complexity(self) -> int:
@@ -341,7 +351,8 @@ class Search:
             return None
         if not self._proved(start, best):
             return None
-        return Found(best, self._equals(best, tried))
+        others = self._equals(best, tried)
+        return Found(self._with_hidden_lag(best), tuple(map(self._with_hidden_lag, others)))
 
     # Unit of time -----------------------------------------------------------------------------
 
@@ -709,6 +720,44 @@ class Search:
             if share == 0.0 and not small:
                 return False
         return True
+
+    def _with_hidden_lag(self, given: Fitted) -> Fitted:
+        """The explanation with the lags that do as well as a part of its offset in time.
+
+        The offset is fitted with the lags that the model knows, so most of a lag that has changed
+        since is taken for a part of it: a shorter delay behind a first-order lag leaves about the
+        same error where that lag is short for the motion.
+        """
+        offset_s = given.hypothesis.later_s
+        if not offset_s:
+            return given
+        margin_s = max(offset_s, 0.0)  # the first rows of an early body have a known past
+
+        def losses(pure_s: float, tau_s: float) -> np.ndarray:
+            return self._lagging(given.hypothesis, margin_s, pure_s, tau_s, 1)
+
+        pure = losses(offset_s, 0.0)
+        limit, longest = self.proof.as_good**2 * pure.sum(), 0.0
+        best, least = (0.0, 0.0), pure
+        for tau_s in HIDDEN_LAGS_S:
+            for share in HIDDEN_SHARES:
+                lagged = losses(offset_s - share * tau_s, tau_s)
+                longest = tau_s if lagged.sum() <= limit else longest
+                if lagged.sum() < least.sum():
+                    best, least = (tau_s, share * tau_s), lagged
+        if self.proof.as_good**2 * least.sum() > pure.sum() or not self._falls(pure, least):
+            best = (0.0, 0.0)
+        return replace(
+            given, hidden_lag_s=longest, likelier_lag_s=best[0], likelier_later_s=offset_s - best[1]
+        )
+
+    def _falls(self, before: np.ndarray, after: np.ndarray) -> bool:
+        """Whether losses (B,) fall significantly from block to block, mm^2."""
+        used = before > 0
+        if used.sum() < 2:
+            return False
+        gain = np.log(before[used] / np.maximum(after[used], 1e-12))
+        return bool(gain.mean() >= self.proof.lag_t * gain.std(ddof=1) / np.sqrt(len(gain)))
 
     def _lagging(
         self, hypothesis: Hypothesis, late_s: float, pure_s: float, tau_s: float, lags: int

@@ -17,6 +17,8 @@ NEAR_AXIS_RAD = 0.1
 LEAST_SHIFT_SD, LEAST_SHIFT_MM = 3.0, 0.5
 """Least shift of a turned frame that is reported as part of the fault: in standard errors, and in
 mm."""
+LEAST_HIDDEN_LAG_S = 0.01
+"""Least lag within an offset of the clocks that is told, s."""
 TIME_NAMES = {1e-3: "ms", 1e-6: "us"}
 """Names of units of time by their seconds."""
 
@@ -228,4 +230,18 @@ def _time(given: Fitted) -> SetupFault:
         f"the key points are {abs(late):.3f} +- {spread:.3f} s {how} relative to the actuation: "
         "their clocks are apart"
     )
-    return SetupFault("time", text, {"late_s": late}, {"late_s": spread})
+    lag, likelier = given.hidden_lag_s, given.likelier_lag_s
+    numbers: dict[str, float | list] = {"late_s": late, "hidden_lag_s": lag}
+    better = ""
+    if likelier:
+        numbers |= {"likelier_lag_s": likelier, "likelier_late_s": given.likelier_later_s}
+        better = (
+            f"{abs(given.likelier_later_s):.2f} s and a lag that has grown by {likelier:.2f} s "
+            "since the fit leave less error; "
+        )
+    if lag >= LEAST_HIDDEN_LAG_S:
+        text += (
+            f" ({better}a lag that has changed by up to {lag:.2f} s would look the same: one "
+            "trigger for both logs tells)"
+        )
+    return SetupFault("time", text, numbers, {"late_s": spread})

@@ -11,6 +11,7 @@ from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.diagnosis.setup import find_setup_faults
 from surgisoft.surrogate.checkpoint import default_arm
 from tests.diagnosis.setup.recordings import (
+    STEP_S,
     driven,
     in_time,
     late,
@@ -139,6 +140,24 @@ def test_an_offset_in_time_is_estimated_within_its_error(model):
     fault = found.faults[0]
     assert fault.numbers["late_s"] == pytest.approx(0.7, abs=4 * fault.errors["late_s"] + 1e-3)
     assert fault.errors["late_s"] < 0.02
+
+
+@pytest.mark.parametrize("rows", [12, -12])
+def test_a_lag_within_an_offset_of_the_clocks_is_told(model, rows):
+    """A line that is slower by 0.2 s delays the body as clocks that are apart by 0.2 s more do."""
+    offset_s = STEP_S * rows
+    slower = find_setup_faults(model, [late(lagged(predicted(), 0.2), rows)])
+    unchanged = find_setup_faults(model, [late(measured(), rows)])
+    assert slower.kinds == unchanged.kinds == ("time",)
+    numbers = slower.faults[0].numbers
+    assert 0.1 < numbers["late_s"] - offset_s < 0.25
+    assert numbers["likelier_lag_s"] == pytest.approx(0.2, abs=0.05)
+    assert numbers["likelier_late_s"] == pytest.approx(offset_s, abs=0.08)
+    assert numbers["hidden_lag_s"] > 0.2
+    assert f"a lag that has grown by {numbers['likelier_lag_s']:.2f} s" in slower.sentence
+    assert f"changed by up to {numbers['hidden_lag_s']:.2f} s would look" in slower.sentence
+    assert "likelier_lag_s" not in unchanged.faults[0].numbers
+    assert "has grown" not in unchanged.sentence
 
 
 PAIRS = [

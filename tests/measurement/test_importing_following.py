@@ -36,10 +36,12 @@ unit = "mm"
 """
 
 
-def recorded(change=lambda p: p, seed=0, seconds=SECONDS, noise_mm=0.05, kind="continuous"):
+def recorded(
+    change=lambda p: p, seed=0, seconds=SECONDS, noise_mm=0.05, kind="continuous", corner_s=0.25
+):
     """An arm that its changed actuation bends; noise of the cameras."""
     rng = np.random.default_rng(seed)
-    p = wander(rng, seconds)
+    p = wander(rng, seconds, corner_s=corner_s)
     points = bent(change(p))
     t_s = np.arange(len(p)) / RATE_HZ
     points = points + rng.normal(0.0, noise_mm, points.shape)
@@ -87,6 +89,43 @@ def test_the_log_of_another_recording_is_told(seed):
     share = max(following(mixed).shifted, 0.0)
     assert f": it explains {share:.0%} of their motion (cross-validated" in warning
     assert "check that the files are of the same recording" in warning
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 0.1])
+@pytest.mark.parametrize("offset_s", [1.4, 2.2, -1.9])
+def test_clocks_apart_by_seconds_are_told_from_lags(offset_s, lag_s):
+    """A body that follows after seconds, but then at once, and one that moves first."""
+    rows = round(abs(offset_s) * RATE_HZ)
+    late, rest = slice(rows, None), slice(None, -rows)
+    for seed in range(3):
+        given = recorded(lambda p: lagged(p, lag_s), seed)
+        body, log = (rest, late) if offset_s > 0 else (late, rest)
+        apart = Recording("arm", given.t_s[rest], given.measured[log], given.key_points_mm[body])
+        found = following(apart)
+        assert found.apart
+        assert found.shift_s == pytest.approx(offset_s + lag_s, abs=0.1)
+        (warning,) = following_warnings(apart, {"measured": 0.0})
+        assert f"set delay_s = {-found.shift_s:.3g} in [measured]" in warning
+
+
+SLOW = {
+    "a lag": lambda p: lagged(p, 1.4),
+    "two lags": lambda p: lagged(p, 0.7, 2),
+    "three lags": lambda p: lagged(p, 0.5, 3),
+    "a dead time of 0.3 s before a lag": lambda p: lagged(np.roll(p, 15, axis=0), 1.0),
+    "play": lambda p: played(p, 14.0),
+    "a swing of 0.3 Hz": lambda p: swung(p, 0.3, 0.6),
+    "a dead time of 0.4 s": lambda p: np.roll(p, 20, axis=0),
+}
+
+
+@pytest.mark.parametrize("name", SLOW)
+@pytest.mark.parametrize("corner_s", [0.25, 0.7, 2.0])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_slow_arm_has_no_late_clock(name, corner_s, seed):
+    """Of slow motion a shift explains most, too: a lag explains more."""
+    given = recorded(SLOW[name], seed, corner_s=corner_s)
+    assert following_warnings(given, {"measured": 0.0}) == []
 
 
 @pytest.mark.parametrize("offset_s", [25.0, -12.0])

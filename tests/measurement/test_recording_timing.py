@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 
-from surgisoft.measurement.importing.timing import body_lead, held_period_s, released
+from surgisoft.measurement.importing.timing import body_lead, held_period_s, released, timing_notes
 from surgisoft.measurement.recordings import Recording
 
 RATE_HZ = 50
@@ -70,6 +70,33 @@ def test_the_lag_of_the_arm_comes_off_the_lead(seed):
     p = wander(rng, 60)
     lead = body_lead(recorded(p, bent(lagged(p, 0.04)), rng, late_rows=6))
     assert lead.seconds == pytest.approx(6 / RATE_HZ - 0.04, abs=0.012)
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("late_s", [0.6, 1.36, 2.6])
+def test_a_log_later_than_the_first_search_is_measured(late_s, seed):
+    """Motion so slow that a shift by 0.5 s explains a part of it."""
+    rng = np.random.default_rng(seed)
+    p = wander(rng, 200, corner_s=1.2 * late_s)
+    lead = body_lead(recorded(p, bent(p), rng, late_rows=round(late_s * RATE_HZ)))
+    assert lead.seconds == pytest.approx(late_s, rel=0.06)
+    assert not lead.at_least
+
+
+def test_a_lead_at_the_end_of_the_search_is_a_least_one():
+    """A log that is 3.6 s late, of a motion so slow that 3 s of them explain most of it."""
+    rng = np.random.default_rng(0)
+    p = wander(rng, 300, corner_s=3.0)
+    late = recorded(p, bent(p), rng, late_rows=round(3.6 * RATE_HZ))
+    lead = body_lead(late)
+    assert lead.at_least
+    assert lead.seconds == pytest.approx(3.0, abs=0.02)
+    (note,) = timing_notes(late, {"measured": 0.5})
+    assert "moves at least 3.000 s, the largest lead that is tried, before" in note
+    assert note.endswith(
+        "set delay_s = 3.500 in [measured] of the map, and import again to see what is left"
+    )
+    assert timing_notes(late, {"measured": 0.5}, lead=False) == []
 
 
 FOLLOWERS = {

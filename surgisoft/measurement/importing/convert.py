@@ -18,7 +18,7 @@ from surgisoft.command_line import typed
 from surgisoft.errors import InputError, path_of
 from surgisoft.files import resolved
 from surgisoft.measurement.importing.align import Joined, join
-from surgisoft.measurement.importing.following import following_warnings
+from surgisoft.measurement.importing.following import following, warnings_of
 from surgisoft.measurement.importing.names import check_columns, uses
 from surgisoft.measurement.importing.plausible import plausibility_notes
 from surgisoft.measurement.importing.points import (
@@ -519,6 +519,8 @@ def _finished(part: Imported, spec: ImportMap) -> Imported:
     command = spec.commanded
     if command and recording.commanded is not None and command.file == spec.measured.file:
         delays_s["commanded"] = command.delay_s
-    notes = [*notes, *timing_notes(recording, delays_s)]
-    warnings = tuple(following_warnings(recording, delays_s))
+    follows = following(recording)
+    apart = follows is not None and follows.apart
+    notes = [*notes, *timing_notes(recording, delays_s, lead=not apart)]
+    warnings = tuple(warnings_of(follows, delays_s))
     return replace(part, recording=recording, notes=notes, warnings=warnings)

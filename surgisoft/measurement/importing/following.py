@@ -19,6 +19,7 @@ from surgisoft.measurement.importing.timing import (
     LEAST_ROWS,
     RIDGE,
     Moves,
+    lagged,
     set_delay,
 )
 from surgisoft.measurement.recordings import Recording
@@ -31,6 +32,24 @@ HARDLY = 0.15
 at the best of many long shifts, chance explains up to EXPLAINED [-]."""
 LEAST_OFFSET = 0.6
 """Least share that the actuation explains where it is shifted by a time that is named [-]."""
+LEAST_DEAD_S = 0.5
+"""Least time after which a body that follows all at once is late by its clock and not by its line:
+pressure and light take less to arrive [s]."""
+LEAST_DEAD = 0.8
+"""Least share that the actuation explains at that time [-]."""
+HALVED = 0.5
+"""Most of the unexplained motion that another time leaves, as a share of what the times as they are
+leave, at once or behind lags [-]."""
+LEAST_LEFT = 0.1
+"""Least share of the motion that the times as they are leave, where the body is early [-]."""
+LEAST_T = 3.0
+"""... and the least mean over standard error, over blocks of time, of its logarithm [-]."""
+LAG_STRETCHES = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0)
+"""Lags, in units of the time, that are compared with a shift by the whole time [-]."""
+LAG_ORDERS = (1, 2, 3)
+"""Equal first-order lags that such a lag consists of (counts)."""
+LAG_SHARES = (0.0, 0.25)
+"""Shares of the time that are a shift, before such a lag [-]."""
 ABOVE_NOISE = 4.0
 """Least mean square of the longest moves, as a multiple of those from one sample to the next: where
 the body moves no more than that, noise may be all there is [-]."""
@@ -65,6 +84,8 @@ class Following:
     """Largest share with the actuation shifted by any time [-]."""
     shift_s: float
     """By how much the body is late at that shift [s]."""
+    apart: bool = False
+    """Whether no lag explains as much as that shift, so that clocks are apart."""
 
 
 def following(recording: Recording) -> Following | None:
@@ -81,14 +102,45 @@ def following(recording: Recording) -> Following | None:
     shifts, best, errors = moves.search(moves.longest)
     explained = 1 - float(errors[best].sum()) / moves.power(moves.longest)
     shift_s = float(shifts[best]) * moves.step_s
+    found = (explained, shift_s)
+    if explained <= EXPLAINED or best in (0, len(shifts) - 1):
+        found = max(_far(moves), found)
     if explained > EXPLAINED:
-        return Following(explained, explained, shift_s)
+        return Following(explained, *found, apart=_apart(moves, explained, *found))
     for share in (_behind_lags, _beyond_own_past):
         explained = max(explained, share(moves))
         if explained > EXPLAINED:
-            return Following(explained, explained, shift_s)
-    shifted, late = max(_far(moves), (explained, shift_s))
-    return Following(explained, shifted, late)
+            return Following(explained, *found, apart=_apart(moves, explained, *found))
+    shifted, late_s = max(found, (explained, shift_s))
+    return Following(explained, shifted, late_s, apart=shifted >= LEAST_OFFSET)
+
+
+def _apart(moves: Moves, explained: float, shifted: float, shift_s: float) -> bool:
+    """Whether body and actuation are apart by this time, and not by a lag.
+
+    explained: the largest share at a usual shift; shifted: the share at this one. A clock delays
+    fast and slow motion alike, a lag spreads it. No lag moves the body first.
+    """
+    shift = shift_s / moves.step_s
+    if shifted < LEAST_DEAD or abs(shift_s) < LEAST_DEAD_S:
+        return False
+    if shift < 0:
+        causal = 1 - max(explained, _behind_lags(moves))
+        return causal >= LEAST_LEFT and 1 - shifted <= HALVED * causal
+    most = round(shift)
+    pure = moves.errors_at(most, most, moves.longest)
+    for share in LAG_SHARES:
+        for by in LAG_STRETCHES:
+            for lags in LAG_ORDERS:
+                samples = (1 - share) * by * shift / lags
+                slow = moves.behind(samples, lags)
+                left = slow.errors_at(round(share * shift), most, moves.longest)
+                if pure.sum() > HALVED * left.sum():
+                    return False
+                gain = np.log(np.maximum(left, 1e-12) / np.maximum(pure, 1e-12))
+                if gain.mean() < LEAST_T * gain.std(ddof=1) / np.sqrt(len(gain)):
+                    return False
+    return True
 
 
 def following_warnings(recording: Recording, delays_s: Mapping[str, float]) -> list[str]:
@@ -96,17 +148,25 @@ def following_warnings(recording: Recording, delays_s: Mapping[str, float]) -> l
 
     delays_s: as for `set_delay`.
     """
-    found = following(recording)
-    if found is None or found.explained > EXPLAINED:
+    return warnings_of(following(recording), delays_s)
+
+
+def warnings_of(found: Following | None, delays_s: Mapping[str, float]) -> list[str]:
+    """The same, of how much the actuation explains."""
+    if found is None:
         return []
-    if found.shifted >= LEAST_OFFSET:
+    if found.apart:
         how = "late" if found.shift_s > 0 else "early"
+        as_it_is = f", and {_percent(found.explained)} as the times are"
+        if found.shift_s > 0 and found.explained > EXPLAINED:
+            as_it_is = ", and at most half of what is left behind a lag"
         return [
             f"the key points follow the actuation {abs(found.shift_s):.3g} s {how} "
-            f"({found.shifted:.0%} of their motion is explained then, and "
-            f"{_percent(found.explained)} as the times are): if the clocks of the files are apart, "
-            f"{set_delay(delays_s, -found.shift_s, '.3g')}"
+            f"({found.shifted:.0%} of their motion is explained then{as_it_is}): if the clocks of "
+            f"the files are apart, {set_delay(delays_s, -found.shift_s, '.3g')}"
         ]
+    if found.explained > EXPLAINED:
+        return []
     if found.explained > HARDLY or found.shifted > EXPLAINED:
         return []
     return [
@@ -164,11 +224,11 @@ def _behind_lags(moves: Moves) -> float:
     features, places = [], []
     every = max(1, sum(len(part) for part in moves.body) // LAGGED_ROWS)
     for actuation, body in zip(moves.actuation, moves.body, strict=True):
-        lagged = np.concatenate([_lagged(actuation, s / moves.step_s) for s in LAGS_S], axis=1)
-        lagged = np.concatenate([lagged, actuation**2], axis=1)
+        behind = np.concatenate([lagged(actuation, s / moves.step_s) for s in LAGS_S], axis=1)
+        behind = np.concatenate([behind, actuation**2], axis=1)
         rows = slice(None, None, every)
         known = ~np.isnan(body[rows]).any(axis=1)
-        features.append(lagged[rows][known])
+        features.append(behind[rows][known])
         places.append(body[rows][known])
     x, y = np.concatenate(features), np.concatenate(places)
     if len(x) < BLOCKS:
@@ -232,15 +292,3 @@ def _errors(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
         left += float(np.square(y[own] - mean - (x[own] - centre) @ slope).sum())
         total += float(np.square(y[own] - mean).sum())
     return left, total
-
-
-def _lagged(values: np.ndarray, rows: float) -> np.ndarray:
-    """(G, m) of values (G, m) behind a first-order lag of so many rows, at rest at the begin."""
-    if rows <= 0.0:
-        return values
-    keep, answer = float(np.exp(-1.0 / rows)), np.empty_like(values)
-    state = values[0]
-    for row, value in enumerate(values):
-        state = value + keep * (state - value)
-        answer[row] = state
-    return answer

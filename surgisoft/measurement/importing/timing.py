@@ -10,6 +10,8 @@ from surgisoft.measurement.recordings import Recording
 
 BACK_S = 0.5
 """Largest shift at which the body moves first [s]."""
+FURTHER_BACK_S = 3.0
+"""... where the best shift is as far back as that one [s]."""
 AHEAD_S = 3.0
 """Largest shift at which the actuation moves first [s]."""
 LEAST_STEP_S = 0.005
@@ -56,6 +58,8 @@ class Moves:
     """Each run's coordinates (G, d) [mm], NaN where missing."""
     longest: int
     """Length of the longest moves, in samples."""
+    back_s: float = BACK_S
+    """Largest shift of a search at which the body moves first [s]."""
 
     @classmethod
     def of(cls, recording: Recording) -> "Moves | None":
@@ -114,7 +118,7 @@ class Moves:
         A positive shift: the body follows its actuation.
         """
         rows, moved = self._rows(length)
-        back, ahead = round(BACK_S / self.step_s), self._ahead(length)
+        back, ahead = round(self.back_s / self.step_s), self._ahead(length)
         coarse = max(1, -(-back // STEPS))
         near = np.arange(-back, min(back, ahead) + 1, coarse)
         far = (
@@ -123,7 +127,11 @@ class Moves:
         shifts = np.union1d(np.union1d(near, far), [0]).astype(int)
         errors = {s: self._errors(rows, moved, length, s) for s in shifts.tolist()}
         best = min(errors, key=lambda s: errors[s].sum())
-        for s in range(best - coarse, best + coarse + 1):
+        below = max((s for s in errors if s < best), default=best)
+        above = min((s for s in errors if s > best), default=best)
+        every = max(1, (above - below) // STEPS)
+        around = {*range(best - coarse, best + coarse + 1), *range(below, above, every)}
+        for s in sorted(around):
             if -back <= s <= ahead and s not in errors:
                 errors[s] = self._errors(rows, moved, length, s)
         shifts = np.array(sorted(errors))
@@ -133,6 +141,26 @@ class Moves:
     def explained_at(self, shift: int, length: int, most_rows: int) -> float:
         """Share of the moves of this length that the actuation, shifted by any number of samples,
         explains: cross-validated, of at most about `most_rows` moves; 0 for too few."""
+        rows, body = self._rows_at(shift, length, most_rows)
+        if len(body) < LEAST_ROWS:
+            return 0.0
+        errors = self._errors(rows, body, length, shift)
+        return 1 - float(errors.sum() / max(np.square(body).sum(), 1e-300))
+
+    def errors_at(self, shift: int, most: int, length: int) -> np.ndarray:
+        """(BLOCKS,) squared error at a shift [mm^2], in the rows that the largest shift leaves."""
+        rows, body = self._rows_at(most, length, ROWS)
+        return self._errors(rows, body, length, shift)
+
+    def behind(self, samples: float, lags: int) -> "Moves":
+        """The moves with the actuation behind equal first-order lags of so many samples each."""
+        parts = self.actuation
+        for _ in range(lags):
+            parts = [lagged(part, samples) for part in parts]
+        return replace(self, actuation=parts)
+
+    def _rows_at(self, shift: int, length: int, most_rows: int) -> tuple[list, np.ndarray]:
+        """Where moves end in each run, and the known ones (S, d) [mm], that a shift leaves."""
         rows, moved = [], []
         every = max(1, sum(len(part) for part in self.body) // most_rows)
         for part in self.body:
@@ -141,11 +169,12 @@ class Moves:
             known = ~np.isnan(move).any(axis=1)
             rows.append(at[known])
             moved.append(move[known])
-        body = np.concatenate(moved)
-        if len(body) < LEAST_ROWS:
-            return 0.0
-        errors = self._errors(rows, body, length, shift)
-        return 1 - float(errors.sum() / max(np.square(body).sum(), 1e-300))
+        return rows, np.concatenate(moved)
+
+    def further_back(self) -> "Moves":
+        """The same moves, searched further back, as far as a third of a usual run allows."""
+        third = np.median([len(part) for part in self.body]) / 3 * self.step_s
+        return replace(self, back_s=max(self.back_s, min(FURTHER_BACK_S, float(third))))
 
     def _ahead(self, length: int) -> int:
         """Largest shift, in samples, that leaves two thirds of a usual run to look at."""
@@ -154,7 +183,7 @@ class Moves:
 
     def _rows(self, length: int) -> tuple[list[np.ndarray], np.ndarray]:
         """Where moves end in each run, and the moves of the body (S, d) [mm] that are known."""
-        back, ahead = round(BACK_S / self.step_s), self._ahead(length)
+        back, ahead = round(self.back_s / self.step_s), self._ahead(length)
         every = max(1, sum(len(part) for part in self.body) // ROWS)
         rows, moved = [], []
         for part in self.body:
@@ -207,6 +236,16 @@ def _seen_on(grid: np.ndarray, t_s: np.ndarray, point: np.ndarray, step: float) 
     return np.where(lost[:, None], np.nan, _on(grid, known_s, point[known]))
 
 
+def lagged(values: np.ndarray, samples: float) -> np.ndarray:
+    """(G, m) of values (G, m) behind a first-order lag of so many samples, at rest at the begin."""
+    if samples <= 0.0:
+        return values
+    from scipy.signal import lfilter  # a tenth of a second, which few imports need
+
+    keep = float(np.exp(-1.0 / samples))
+    return lfilter([1.0 - keep], [1.0, -keep], values, axis=0, zi=keep * values[:1])[0]
+
+
 def _spread(column: np.ndarray) -> float:
     """Standard deviation of what is known."""
     known = column[~np.isnan(column)]
@@ -251,6 +290,8 @@ class Lead:
     """Best estimate, which includes the lag of the arm [s]."""
     ci95_s: tuple[float, float]
     """95 % interval, by a jackknife over blocks of time [s]."""
+    at_least: bool = False
+    """Whether the lead is the largest one that was tried."""
 
 
 def held_period_s(recording: Recording) -> float | None:
@@ -317,6 +358,11 @@ def body_lead(recording: Recording) -> Lead | None:
     if moves is None or moves.power(moves.longest) == 0.0:
         return None
     first, best, error = moves.search(moves.longest)
+    if best in (0, len(first) - 1):
+        further = moves.further_back()
+        if len(further._rows(moves.longest)[1]) >= LEAST_ROWS:
+            moves = further
+            first, best, error = moves.search(moves.longest)
     causal = error[first >= 0].sum(axis=1)
     won = error[first >= 0][causal.argmin()] - error[best]
     if first[best] >= 0 or won.sum() < LEAST_SHARE * causal.min():
@@ -334,7 +380,8 @@ def body_lead(recording: Recording) -> Lead | None:
     if seconds + 2 * spread >= 0:
         return None
     step = moves.step_s
-    return Lead(-seconds * step, (-(seconds + 2 * spread) * step, -(seconds - 2 * spread) * step))
+    low, high = -(seconds + 2 * spread) * step, -(seconds - 2 * spread) * step
+    return Lead(-seconds * step, (low, high), at_least=best == 0)
 
 
 def set_delay(delays_s: Mapping[str, float], more_s: float, digits: str = ".3f") -> str:
@@ -349,10 +396,12 @@ def set_delay(delays_s: Mapping[str, float], more_s: float, digits: str = ".3f")
     return f"set {' and '.join(parts)} of the map"
 
 
-def timing_notes(recording: Recording, delays_s: Mapping[str, float]) -> list[str]:
+def timing_notes(
+    recording: Recording, delays_s: Mapping[str, float], lead: bool = True
+) -> list[str]:
     """Notes about a delay of the actuation's clock, with what to put into the import's map.
 
-    delays_s: as for `set_delay`.
+    delays_s: as for `set_delay`; lead: whether a lead of the body is told.
     """
     notes = []
     period = held_period_s(recording)
@@ -363,13 +412,17 @@ def timing_notes(recording: Recording, delays_s: Mapping[str, float]) -> list[st
             'the body moves on: if its sensor is slower than the log, set repeated = "interpolate" '
             "in [measured] of the map"
         )
-    lead = body_lead(recording)
-    if lead is not None:
-        low, high = lead.ci95_s
+    found = body_lead(recording) if lead else None
+    if found is not None:
+        low, high = found.ci95_s
+        within = f"{found.seconds:.3f} s ({low:.3f} to {high:.3f})"
+        again = ""
+        if found.at_least:
+            within = f"at least {found.seconds:.3f} s, the largest lead that is tried,"
+            again = ", and import again to see what is left"
         notes.append(
-            f"the body moves {lead.seconds:.3f} s ({low:.3f} to {high:.3f}) before its measured "
-            "actuation, which no arm that follows it can: if the actuation was logged late, "
-            f"{set_delay(delays_s, lead.seconds)}"
+            f"the body moves {within} before its measured actuation, which no arm that follows it "
+            f"can: if the actuation was logged late, {set_delay(delays_s, found.seconds)}{again}"
         )
     return notes
 

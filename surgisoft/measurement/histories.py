@@ -144,11 +144,13 @@ def speed_of(
     """How fast the actuation moves, as a share of its range in a second, 1/s.
 
     It is the `SPEED_QUANTILE` over all rows of the change within `SPEED_S`, of the chamber that
-    moves most; span: (m,) range of each chamber, in the recordings' unit. 0 where recordings have
-    steady states alone.
+    moves most; 0 where recordings have steady states alone. span: (m,) range of each chamber, in
+    the recordings' unit, 0 of one that rests.
     """
+    ranges = np.asarray(span, float)
+    own = np.where(ranges > 0.0, ranges, np.inf)
     runs = [
-        (recording.t_s[run], actuation_of(recording, actuation)[run] / np.asarray(span))
+        (recording.t_s[run], actuation_of(recording, actuation)[run] / own)
         for recording in recordings
         if recording.kind != "settled"
         for run in recording.runs

@@ -58,6 +58,16 @@ def test_questions_that_cannot_be_asked_are_one_line():
         assert message in refusal(call)
 
 
+def test_a_body_that_moves_without_actuation_is_refused():
+    """A log that kept its first row, of an arm whose tip goes over twice its length."""
+    points = POINTS + 10.0 * np.sin(np.arange(ROWS) / 9.0)[:, None, None] * [1.0, 0.0, 0.0]
+    dead = replace(some(), key_points_mm=points, measured=np.full((ROWS, 2), 2.0), commanded=None)
+    for asked in (diagnose, compare):
+        text = refusal(lambda asked=asked: asked(still_model(), [dead]))
+        assert "no channel of the actuation moves (2, 2 kPa in every row)" in text
+        assert "and import again" in text
+
+
 def test_held_out_rows_are_opened_once():
     sealed = Sealed([some()])
     table = residual_table(still_model(), sealed.training)

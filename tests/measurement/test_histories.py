@@ -99,6 +99,9 @@ def test_no_speed_leads_from_run_to_run_and_steady_states_have_none():
     broken = replace(slow, measured=slow.measured + lift, run=(slow.t_s >= 20.0).astype(int))
     assert speed_of([broken], (50.0, 50.0)) == pytest.approx(2 / 8.0, rel=1e-3)
     assert speed_of([replace(slow, kind="settled")], (50.0, 50.0)) == 0.0
+    # A chamber that rests has no range, and no speed.
+    resting = replace(slow, measured=np.full_like(slow.measured, 50.0))
+    assert speed_of([resting], (0.0, 0.0)) == 0.0
 
 
 def test_motion_that_is_faster_than_that_of_the_fit_is_noted():

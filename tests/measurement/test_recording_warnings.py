@@ -337,3 +337,21 @@ def test_loader_names_line_and_channel(tmp_path):
     )
     load_recordings(tmp_path / "b.parquet", on_warning=said.append)
     assert said[0].startswith(f"{tmp_path}/b.parquet, row 401: p1_kPa")
+
+
+def test_a_body_that_moves_under_constant_actuation_is_told():
+    """A dead log: the tip goes through 30 tanh(80/50) mm to each side, and less along the arm."""
+    alive = slow_and_noisy(0, noise=0.0)
+    dead = dataclasses.replace(alive, measured=np.full_like(alive.measured, 50.0), commanded=None)
+    (found,) = [each for each in find_warnings(dead) if "no channel" in each.text]
+    assert found.sample == 0
+    tip = np.quantile(alive.key_points_mm[:, 2], (0.01, 0.99), axis=0)
+    moved = np.sqrt(np.square(tip[1] - tip[0]).sum())
+    assert f"(50, 50 kPa in every row), while key point k2 moves by {moved:.3g} mm" in found.text
+    with_command = dataclasses.replace(dead, commanded=alive.commanded)
+    creeping = dataclasses.replace(
+        dead,
+        key_points_mm=dead.key_points_mm[:1] + 0.05 * (dead.key_points_mm - dead.key_points_mm[:1]),
+    )
+    for other in (alive, with_command, creeping):
+        assert not any("no channel" in each.text for each in find_warnings(other))

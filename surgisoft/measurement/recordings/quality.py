@@ -55,6 +55,11 @@ MOST_PERIODS = 10
 """Periods that are tried for a stretch, the shortest first (a count)."""
 MOST_MOTIONS = 20
 """Periodic motions that are looked for in a run (a count)."""
+ALONE_SHARE = 0.1
+"""Least motion of a key point, as a share of the arm's length, that constant actuation does not
+explain: an arm that creeps or swings out under it moves less [-]."""
+MOTION_QUANTILES = (0.01, 0.99)
+"""Quantiles of a coordinate between which that motion lies: lost markers jump far [-]."""
 MIX = np.uint64(0x9E3779B97F4A7C15)
 """Odd number by which hashes of values are multiplied (2^64 over the golden ratio, Knuth 1973)."""
 
@@ -75,7 +80,45 @@ def find_warnings(recording: Recording) -> list[QualityWarning]:
     with np.errstate(over="ignore", invalid="ignore"):  # finite numbers of any size are read
         found = [*_frozen_channels(recording), *_frozen_key_points(recording), *jumps(recording)]
     found += _copied_rows(recording)
+    if alone := moves_alone([recording]):
+        found.append(QualityWarning(0, alone))
     return sorted(found, key=lambda warning: warning.sample)
+
+
+def moves_alone(recordings: list[Recording]) -> str:
+    """In words, that the body moves while all actuation keeps its value in every row; else empty.
+
+    The motion is that of the key point that moves most, compared with the length of the arm or,
+    where it is not stated, with the distance between its first and last key point.
+    """
+    signal = np.concatenate([recording.measured for recording in recordings])
+    if len(signal) < LEAST_FROZEN_ROWS or (signal != signal[0]).any():
+        return ""
+    if any(ranges.any() for recording in recordings for _, ranges in recording.actuation_ranges):
+        return ""
+    points = np.concatenate([recording.key_points_mm for recording in recordings])
+    known = ~np.isnan(points).any(axis=2)
+    moved = [
+        float(
+            np.linalg.norm(np.ptp(np.quantile(points[seen, j], MOTION_QUANTILES, axis=0), axis=0))
+        )
+        if seen.any()
+        else 0.0
+        for j, seen in enumerate(known.T)
+    ]
+    length = recordings[0].arm.length_mm
+    both = known[:, 0] & known[:, -1]
+    if length is None and both.any():
+        length = float(np.median(np.linalg.norm(points[both, -1] - points[both, 0], axis=1)))
+    most = int(np.argmax(moved))
+    if not length or moved[most] < ALONE_SHARE * length:
+        return ""
+    values = ", ".join(f"{value:.4g}" for value in signal[0])
+    return (
+        f"no channel of the actuation moves ({values} {recordings[0].unit} in every row), while "
+        f"key point k{most} moves by {moved[most]:.3g} mm: check the log, and the columns of "
+        "[measured] in the map"
+    )
 
 
 # --- copies -------------------------------------------------------------------------------------

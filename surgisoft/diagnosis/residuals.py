@@ -30,7 +30,7 @@ from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.chain import Taps
 from surgisoft.surrogate.history import History
-from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.model import LEFT_OF_MOTION, ArmModel
 from surgisoft.surrogate.scan import linear_scan
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.time_axis import continued
@@ -713,9 +713,6 @@ def noise_of_validation(model: ArmModel, noise_mm: np.ndarray) -> np.ndarray:
 
 # Whose arm it is ----------------------------------------------------------------------------------
 
-LEFT_OF_MOTION = 0.35
-"""Most error of a model of this arm, as a share of the motion of the key points: with a correct
-set-up it predicts most of the motion, whatever physics is missing."""
 WHOSE_ARM = (
     "check that MODEL is of this arm, and in the map the columns of [measured] and [key_points], "
     "their units and [frame]"

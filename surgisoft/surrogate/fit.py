@@ -38,7 +38,7 @@ from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.interval import ErrorInterval, calibrate, coverage_of, distance_to
 from surgisoft.surrogate.kernel_fit import KernelFit, fit_kernel
-from surgisoft.surrogate.model import ArmModel, arm_facts
+from surgisoft.surrogate.model import LEFT_OF_MOTION, ArmModel, Validation, arm_facts
 from surgisoft.surrogate.networks import (
     HIDDEN,
     ConstantCurvature,
@@ -545,6 +545,7 @@ def _finish(data: Data, result: FitResult) -> None:
     for number, value in enumerate(validation.per_key_point_mm):
         if value is None:
             result.warnings.append(f"key point k{number} is missing in all held-out rows")
+    result.warnings += _left_unexplained(validation, train if valid is None else valid)
     result.model.eval().requires_grad_(False)
     result.known = result.model.residuals_on([train] if valid is None else [train, valid])
     result.model.training_residuals = result.known
@@ -552,6 +553,24 @@ def _finish(data: Data, result: FitResult) -> None:
     if valid is not None:
         known = known.joined(FittedRows.of([valid], "chosen"))
     result.model.fitted_rows = known
+
+
+def _left_unexplained(validation: Validation, judged: History) -> list[str]:
+    """A note where a model leaves more of the motion than any model of the arm should.
+
+    Its error, less the noise of the key points, is compared with their motion in `judged`.
+    """
+    points = judged.rows(judged.key_points)
+    motion = _rmse((points - points.nanmean(0)).square())
+    error, noise = validation.rmse_mm or 0.0, math.sqrt(3.0) * (validation.noise_mm or 0.0)
+    if math.sqrt(max(error**2 - noise**2, 0.0)) <= LEFT_OF_MOTION * motion:
+        return []
+    return [
+        f"the model leaves {error:.3g} mm of a motion of {motion:.3g} mm, so the key points hardly "
+        "follow the actuation in these recordings: check the clocks (delay_s in the map), that the "
+        "files are of the same recording, and the columns; a long memory of the arm may be learned "
+        "with --effects auto"
+    ]
 
 
 def _still_chambers(train: History, spec: ArmSpec) -> list[str]:

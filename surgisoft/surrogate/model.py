@@ -30,6 +30,9 @@ from surgisoft.surrogate.training_residuals import PAST_ROWS, ROWS, Past, Traini
 AWAY_SHARE = 0.15
 """A run begins away from rest where a chamber's measured actuation is farther from it than this
 share of its range."""
+LEFT_OF_MOTION = 0.35
+"""Most error of a model of an arm, as a share of the motion of the key points: with a correct
+set-up it predicts most of the motion, whatever physics is missing."""
 
 Network = (
     HawNN

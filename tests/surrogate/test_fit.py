@@ -588,6 +588,18 @@ def test_a_fit_keeps_residuals_of_both_recordings_and_notes_what_hardly_moved(mo
     assert note.startswith(f"chamber 2 hardly moved ({0.1 * float(span[1]):.3g} kPa in all)")
 
 
+def test_a_fit_that_leaves_most_of_the_motion_says_so(monkeypatch, walks):
+    """A model that rests in the middle of key points that are 1 mm to either side."""
+    fitted = fit(walks[0], walks[1], SPEC, replace(QUICK, epochs=10, inputs="pressure"))
+    assert not [each for each in fitted.warnings if "of a motion of" in each]
+    prescribed(monkeypatch, {"pressure": 0.0})
+    config = FitConfig(hidden=(4,), prior="none", inputs="pressure", check_excitation=False)
+    sides = at(np.repeat([-1.0, 1.0], 100))
+    (note,) = [each for each in fit(sides, sides, SPEC, config).warnings if "a motion of" in each]
+    assert note.startswith("the model leaves 1 mm of a motion of 1 mm")
+    assert "check the clocks (delay_s in the map)" in note
+
+
 def test_a_loss_of_the_progress_is_told_as_a_distance():
     """Every coordinate moves by 10 mm; all errors are (1, 2, 2) mm, 3 mm apart."""
     measured = torch.tensor([[[0.0, 0.0, 0.0]], [[10.0, 10.0, 10.0]]])

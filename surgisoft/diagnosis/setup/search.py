@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from surgisoft.diagnosis.residuals import LEFT_OF_MOTION, NOTICED
+from surgisoft.diagnosis.residuals import NOTICED
 from surgisoft.diagnosis.setup.alignment import (
     HANDED,
     Frame,
@@ -37,7 +37,7 @@ from surgisoft.diagnosis.setup.sample import (
 from surgisoft.measurement.recordings.clock import follows_motion, impossible, time_factors
 from surgisoft.measurement.units import unit_mistakes
 from surgisoft.surrogate.effects.misalignment import Misalignment
-from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.model import LEFT_OF_MOTION, ArmModel
 
 Kind = Literal["chambers", "actuation_unit", "key_points", "length_unit", "frame", "time"]
 """Kinds of faults that one search combines, in the order in which they are told."""

@@ -129,6 +129,12 @@ def fit(
     from surgisoft.surrogate.networks import parse_widths
 
     claim_folder(output, force)
+
+    def tell(stage: str, epoch: int, of: int, loss: float) -> None:
+        # The kernel's loss is that of the result, the others weigh key points by their motion.
+        what = "held-out RMSE" if stage == "kernel" else "held-out RMS weighted by motion"
+        report(epoch, of, f"{stage}: {what} {rms_of_loss(stage, loss):.4f} mm")
+
     with progress("fit") as report:
         try:
             result = fit_model(
@@ -136,9 +142,7 @@ def fit(
                 held,
                 actuation=actuation,
                 threads=threads,
-                progress=lambda stage, epoch, of, loss: report(
-                    epoch, of, f"{stage}: held-out RMS {rms_of_loss(stage, loss):.4f} mm"
-                ),
+                progress=tell,
                 network=network,
                 inputs=inputs,
                 effects=[name for item in effects or [] for name in item.split(",")],

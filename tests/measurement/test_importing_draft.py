@@ -58,6 +58,24 @@ def test_a_draft_imports_its_file(tmp_path, header, layout, pressure, scale):
     np.testing.assert_allclose(found.key_points_mm.reshape(-1, 6), expected)
 
 
+@pytest.mark.parametrize(
+    ("above", "unit", "mm"),
+    [
+        ("Exported,2026-11-28,Length Units,Meters,Coordinate Space,Global\n\n", "m", 1000.0),
+        ("Length Units: Centimeters\n", "cm", 10.0),
+        ("Units,mm\n", "mm", 1.0),
+    ],
+)
+def test_the_unit_of_length_above_a_header_is_drafted(tmp_path, above, unit, mm):
+    """Motion capture states it once; the names of the columns then have none."""
+    path = lab_file(tmp_path, "t_s,p1_kPa,p2_kPa,a X,a Y,a Z,b X,b Y,b Z", above=above)
+    line = next(line for line in draft_map(path).splitlines() if "lines above the header" in line)
+    assert line.startswith(f'unit = "{unit}"  #')
+    expected = mm * np.array([row[3:] for row in ROWS])
+    found = imported(path, tmp_path).key_points_mm.reshape(-1, 6)
+    np.testing.assert_allclose(found, expected)
+
+
 def test_what_a_header_does_not_say_is_marked(tmp_path):
     header = "take,pressure1,set1,x0,y0,z0,target_x,target_y,target_z"
     text = draft_map(lab_file(tmp_path, header))

@@ -50,6 +50,21 @@ AN_AXIS = re.compile(r"(^|[_ .])[xyz]($|[_ .\d])", re.I)
 """An axis in the name of a position."""
 
 
+LENGTH_UNIT = re.compile(
+    r"(?:length|position|distance)[ _]?units?\s*[,;:=\t]\s*\"?(\w+)|^units?\s*[,;:=\t]\s*\"?(\w+)",
+    re.I | re.M,
+)
+"""The unit of length in the lines above a header, as motion capture writes it."""
+LENGTH_NAMES = {
+    "meters": "m",
+    "metres": "m",
+    "centimeters": "cm",
+    "centimetres": "cm",
+    "millimeters": "mm",
+    "millimetres": "mm",
+    "inches": "in",
+}
+"""Units of length by the words for them."""
 A_PLACE = re.compile(r"((\.\d+)+)$")
 """The place of a column in an array of several columns: `.2` of `tip_cm.2`."""
 
@@ -72,6 +87,8 @@ class _Layout:
     """The group or struct to which the draft limits the file."""
     groups: tuple[str, ...] = ()
     """All groups or structs that hold the same columns as that one."""
+    length_unit: str = ""
+    """Unit of length that the lines above the header state; empty: none."""
 
     def label(self, name: str) -> str:
         """Part of a column's name that describes it: of a path, the name of the array."""
@@ -366,7 +383,8 @@ def _actuation(
 def _key_points_table(main: _Recognised) -> list[str]:
     """The table [key_points], and the fields of [frame] as comments."""
     triples = ", ".join(f"[{', '.join(main.named(point))}]" for point in main.points)
-    unit = _unit(main.labels([k for point in main.points for k in point]), MM_PER, "mm")
+    stated = main.layout.length_unit
+    unit = _unit(main.labels([k for point in main.points for k in point]), MM_PER, "mm", stated)
     lines = ["[key_points]  # check: from base to tip", f"positions = [{triples}]"]
     lines += [f"unit = {unit}", ""]
     if not main.points:
@@ -439,12 +457,25 @@ def _layout(path: Path) -> _Layout:
         head = None
     if head is None:
         return _Layout(("",) * most, separator, "," if comma else ".", first, False)
+    stated = _stated_length("\n".join(lines[:head]))
     names = [name.strip().removeprefix("#").strip().strip('"') for name in rows[head]]
     if units:
         names = [f"{name} [{unit.strip('[]() ')}]" for name, unit in zip(names, units, strict=True)]
     return _Layout(
-        tuple(names), separator, "," if comma else ".", first if units else head, not units
+        tuple(names),
+        separator,
+        "," if comma else ".",
+        first if units else head,
+        not units,
+        length_unit=stated,
     )
+
+
+def _stated_length(above: str) -> str:
+    """The unit of length that lines above a header state; empty where they state none."""
+    found = LENGTH_UNIT.search(above)
+    word = (found[1] or found[2]).lower() if found else ""
+    return LENGTH_NAMES.get(word, word if word in MM_PER else "")
 
 
 def _cells(line: str, separator: str) -> list[str]:
@@ -535,9 +566,14 @@ def _is_actuation(name: str) -> bool:
     return bool(unit) or ACTUATION.search(stem) is not None
 
 
-def _unit(names: Sequence[str], units: Iterable[str], otherwise: str) -> str:
-    """The unit of columns as TOML, marked where their names state none, or several."""
+def _unit(names: Sequence[str], units: Iterable[str], otherwise: str, stated: str = "") -> str:
+    """The unit of columns as TOML, marked where their names state none, or several.
+
+    stated: the unit that the lines above the header state, for columns whose names state none.
+    """
     found = list(dict.fromkeys(unit for name in names if (unit := _split(name, units)[1])))
+    if not found and stated:
+        return f'"{stated}"  # as the lines above the header say'
     if not found:
         return f'"{otherwise}"  # check: the header names no unit'
     more = "" if len(found) == 1 else f"  # check: the header names {', '.join(found)}"

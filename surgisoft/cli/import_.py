@@ -45,6 +45,16 @@ def import_(
             "a recording, need no map.",
         ),
     ] = None,
+    delay_s: Annotated[
+        float | None,
+        typer.Option(
+            "--delay-s",
+            metavar="S",
+            help="Delay of the log of the actuation, s, in place of delay_s in [measured] (and "
+            "[commanded], if it is in the same file) of the map, which then serves recordings "
+            "whose clocks were started by hand.",
+        ),
+    ] = None,
     draft: Annotated[
         Path | None,
         typer.Option(
@@ -82,6 +92,7 @@ def import_(
 
     if draft is not None:
         others = {"-o": output, "--map": map_name, "--dry-run": dry_run, "--model": model}
+        others["--delay-s"] = delay_s is not None
         if unused := [option for option, value in others.items() if value]:
             raise InputError(
                 f"--draft with {' and '.join(unused)}: --draft only writes a draft of a map, "
@@ -102,7 +113,7 @@ def import_(
     if to_file and output.suffix not in (".csv", ".parquet"):
         raise InputError(f"{output}: suffix '{output.suffix}', expected .csv, .parquet or a folder")
     name = output.stem if to_file else None
-    parts = import_recordings(raw, map_name, name)
+    parts = import_recordings(raw, map_name, name, delay_s)
     if to_file and len(parts) > 1:
         raise InputError(f"{output}: {len(parts)} recordings, expected a folder for them")
     targets = [output if to_file else output / f"{part.recording.name}.parquet" for part in parts]

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from surgisoft.cli import run
 from surgisoft.errors import InputError
-from surgisoft.measurement.importing import import_files
+from surgisoft.measurement.importing import import_files, import_recordings
+from surgisoft.measurement.recordings import load_recordings
 
 from .test_importing import spec, text, written
 
@@ -171,3 +173,43 @@ def test_held_readings_are_noted_until_the_map_interpolates_them(tmp_path):
     assert any("held in between: 4800 of 6000 rows interpolated" in note for note in notes)
     assert not any("[measured]" in note for note in notes)
     np.testing.assert_allclose(recording.measured[:5990], now[:5990], atol=0.2)
+
+
+def test_a_delay_in_place_of_the_maps(tmp_path, capsys):
+    """One map serves files whose clocks are apart by different times."""
+    t_s = np.arange(400) / 100
+    file = written(tmp_path / "a.csv", text(late(t_s, 0.05), header=HEADER))
+    content = MAP.replace("MEASURED", "delay_s = 0.31").replace("COMMANDED", "delay_s = 0.2")
+    (tmp_path / "map.toml").write_text(content.replace("REST", ""))
+    (part,) = import_recordings(file, tmp_path / "map.toml", "a", delay_s=0.05)
+    actuation, _ = truth(part.recording.t_s)
+    np.testing.assert_allclose(part.recording.measured, actuation, atol=1e-9)
+    np.testing.assert_allclose(part.recording.commanded, actuation, atol=1e-9)
+    given = ["import", str(file), "--map", str(tmp_path / "map.toml"), "--delay-s", "0.05"]
+    assert run([*given, "-o", str(tmp_path / "a.parquet")]) == 0
+    (same,) = load_recordings(tmp_path / "a.parquet")
+    np.testing.assert_array_equal(same.measured, part.recording.measured)
+    assert "measured actuation read +0.05 s from each row" in capsys.readouterr().out
+    for delay_s, message in ((float("nan"), "expected a finite number"), (0.1, "without a map")):
+        with pytest.raises(InputError, match=message):
+            import_recordings(
+                file, None if delay_s == 0.1 else tmp_path / "map.toml", None, delay_s
+            )
+
+
+def test_the_command_of_another_file_keeps_its_delay(tmp_path):
+    t_s = np.arange(400) / 100
+    table = late(t_s, 0.05)
+    written(
+        tmp_path / "a_cam.csv", text(table[:, [0, 1, 2, 5, 6, 7]], header=HEADER[:3] + HEADER[5:])
+    )
+    written(tmp_path / "a_set.csv", text(table[:, [0, 3, 4]], header=["t", "c", "d"]))
+    content = MAP.replace("MEASURED", "").replace("REST", "")
+    content = content.replace("COMMANDED", 'delay_s = 0.05\nfile = "set"')
+    roles = '[file.cam]\nmatch = "*_cam.csv"\n[file.set]\nmatch = "*_set.csv"\n'
+    (tmp_path / "map.toml").write_text(roles + content)
+    files = [tmp_path / "a_cam.csv", tmp_path / "a_set.csv"]
+    (part,) = import_recordings(files, tmp_path / "map.toml", "a", delay_s=0.0)
+    kept = part.recording.t_s
+    np.testing.assert_allclose(part.recording.measured, truth(kept - 0.05)[0], atol=1e-9)
+    np.testing.assert_allclose(part.recording.commanded, truth(kept)[0], atol=1e-9)

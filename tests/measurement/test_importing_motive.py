@@ -135,6 +135,15 @@ def test_rows_outside_of_the_log_or_in_its_gaps_are_left_out(tmp_path):
     )
 
 
+def test_a_log_of_other_names_is_told_to_be_drafted(tmp_path):
+    files = [take(tmp_path / "take.csv"), tmp_path / "log.csv"]
+    files[1].write_text("t_s,act A [bar]\n0,1\n1,2\n")
+    with pytest.raises(InputError, match="no column 'p1_kPa'") as error:
+        imported(files)
+    told = f"surgisoft import {files[0]} {files[1]} --draft map.toml"
+    assert str(error.value).endswith(told)
+
+
 def test_log_without_command_gives_none(tmp_path):
     log = write_log(tmp_path / "log.csv", np.arange(0, 4.2, 0.05), command=False)
     recording, _ = imported([take(tmp_path / "t.csv"), log])

@@ -94,6 +94,7 @@ def import_recordings(
     raw: Iterable[str | Path] | str | Path,
     map_file: str | Path | None = None,
     name: str | None = None,
+    delay_s: float | None = None,
 ) -> list[Imported]:
     """The recordings in a laboratory's files, not yet saved, with notes on what was done.
 
@@ -103,12 +104,21 @@ def import_recordings(
     raw: files or folders. map_file: a map (docs/recordings.md), or `motive`; None: the files are
     logs of interrupted recordings (.jsonl) or LeRobotDatasets with a recording's names, which need
     none. name: the files are the runs of one recording of this name; None: each set of files is a
-    recording, named after its main file.
+    recording, named after its main file. delay_s: delay of the actuation's log [s], in place of
+    that of the map: of [measured], and of [commanded] where it is in the same file.
     """
+    if delay_s is not None and not np.isfinite(delay_s):
+        raise InputError(f"delay_s: got {delay_s}, expected a finite number of seconds")
+    if delay_s is not None and map_file is None:
+        raise InputError(
+            f"delay_s {delay_s:g} without a map: it takes the place of delay_s in [measured] of a "
+            "map, expected one; give it with --map"
+        )
     given = [raw] if isinstance(raw, str | Path) or not isinstance(raw, Iterable) else raw
     paths = [path_of("a raw file", path) for path in given]
     if map_file is not None:
-        return import_files(paths, load_map(str(map_file)), name)
+        spec = load_map(str(map_file))
+        return import_files(paths, spec if delay_s is None else _delayed(spec, delay_s), name)
     if paths and all(path.suffix == LOG_SUFFIX for path in paths):
         return _named_apart([import_log(path, name or path.stem) for path in paths])
     if paths and all(is_dataset(path) for path in paths):
@@ -118,6 +128,14 @@ def import_recordings(
         "--map is missing: a map file states columns, units and frames; "
         f"'surgisoft import{shown} --draft map.toml' writes one to start from"
     )
+
+
+def _delayed(spec: ImportMap, delay_s: float) -> ImportMap:
+    """The map with another delay of the log of its actuation."""
+    measured, command = replace(spec.measured, delay_s=delay_s), spec.commanded
+    if command is not None and command.file == measured.file:
+        command = replace(command, delay_s=delay_s)
+    return replace(spec, measured=measured, commanded=command)
 
 
 def import_log(path: Path, name: str) -> Imported:
@@ -303,10 +321,15 @@ def _with_columns(spec: ActuationMap, tables: dict[str, RawTable], part: str) ->
     if not found and spec.optional:
         return spec
     if not found:
-        without = ", or leave the table out" if part == "commanded" else ""
+        paths = dict.fromkeys(each.path for each in tables.values())
+        otherwise = (
+            "leave the table out"
+            if part == "commanded"
+            else f"draft a map of these files: surgisoft import {typed(*paths)} --draft map.toml"
+        )
         raise InputError(
             f"{table.path}: no column '{letter}1_kPa' or with another unit, expected the {part} "
-            f"actuation; name its columns in [{part}] of the map{without}"
+            f"actuation; name its columns in [{part}] of the map, or {otherwise}"
         )
     names = tuple(name for _, _, name in found)
     counted = f"{names[0]}{f' ... {names[-1]}' if names[1:] else ''}"

@@ -139,7 +139,7 @@ def import_(
         about = first.partition(": ")[2]
         print(f"{'would write' if dry_run else 'wrote'} {target}: {about}", *rest, sep="\n")
     if arm:
-        _test_setup(arm, str(model), [part.recording for part in parts])
+        _test_setup(arm, str(model), [part.recording for part in parts], targets)
 
 
 def _check_kept(read: list[Path], targets: list[Path]) -> None:
@@ -188,10 +188,11 @@ def _draft(raw: list[Path], place: Path, force: bool) -> None:
     )
 
 
-def _test_setup(arm: "ArmModel", name: str, recordings: list) -> None:
-    """Print what a model shows to be wrong with the set-up of recordings; name: of the model."""
+def _test_setup(arm: "ArmModel", name: str, recordings: list, files: list[Path]) -> None:
+    """Print what a model shows to be wrong with the set-up of recordings, which become these files;
+    name: of the model."""
     from surgisoft.diagnosis.residuals import WHOSE_ARM, fit_of_model
-    from surgisoft.diagnosis.setup import find_setup_faults
+    from surgisoft.diagnosis.setup import find_setup_faults, find_small_frame
 
     found = find_setup_faults(arm, recordings)
     if found is None:
@@ -202,6 +203,15 @@ def _test_setup(arm: "ArmModel", name: str, recordings: list) -> None:
         error = f"error {fit.rmse_mm:.3g} mm, expected about {fit.expected_mm:.3g} mm"
         if fit.fits:
             print(f"set-up faults: none found by comparison with {name} ({error})")
+            return
+        moved = find_small_frame(arm, recordings)
+        if moved is not None:
+            fault, left_mm = moved
+            warn(
+                f"set-up: {fault.sentence} (error {fit.rmse_mm:.3g} mm as recorded, about "
+                f"{left_mm:.3g} mm in that frame): a camera or a base that was moved, or another "
+                f"effect; which one: surgisoft diagnose {typed(name)} {typed(*files)}"
+            )
             return
         warn(
             f"set-up: {name} does not describe this arm's motion of {fit.motion_mm:.3g} mm "

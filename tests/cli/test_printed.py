@@ -662,6 +662,13 @@ def test_an_import_names_what_looks_wrong(bench, tmp_path, capsys, monkeypatch):
     assert "none found by comparison" not in shown.out
     assert "default does not describe this arm's motion of 10 mm (error 54 mm, " in shown.err
     assert "no fault that is tested explains it: check that MODEL is of this arm" in shown.err
+    small = SimpleNamespace(sentence="the frame of the key points is turned by 3.0 deg about z")
+    monkeypatch.setattr("surgisoft.diagnosis.setup.find_small_frame", lambda *_: (small, 0.6))
+    assert run([*command, "--model", "default"]) == 0
+    shown = capsys.readouterr()
+    assert "turned by 3.0 deg about z (error 54 mm as recorded, about 0.6 mm in that" in shown.err
+    assert f"which one: surgisoft diagnose default {new}\n" in shown.err
+    assert "does not describe" not in shown.err
     monkeypatch.setattr(
         faults, lambda *_: found_setup(sentence="turned by 90 degrees", recordings=("bench",))
     )

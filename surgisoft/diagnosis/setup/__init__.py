@@ -5,7 +5,7 @@ effect of the catalogue describes to first order. `find_setup_faults` tests what
 any physics, alone and together, and names what the error on held-out blocks proves.
 """
 
-from surgisoft.diagnosis.setup.result import SetupResult, find_setup_faults
+from surgisoft.diagnosis.setup.result import SetupResult, find_setup_faults, find_small_frame
 from surgisoft.diagnosis.setup.words import SetupFault
 
-__all__ = ["SetupFault", "SetupResult", "find_setup_faults"]
+__all__ = ["SetupFault", "SetupResult", "find_setup_faults", "find_small_frame"]

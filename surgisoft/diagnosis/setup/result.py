@@ -32,6 +32,7 @@ from surgisoft.diagnosis.setup.search import (
 from surgisoft.diagnosis.setup.words import (
     SetupFault,
     faults_of,
+    frame_fault,
     joined,
     signed_axes,
     time_unit_fault,
@@ -159,6 +160,24 @@ def find_setup_faults(model: ArmModel, recordings: Sequence[Recording]) -> Setup
     same = [each for each, result in alone if result.kinds == first.kinds]
     together = _of_one_setup(model, same) if same[1:] else first
     return named(together, same) if together else named(first, [one])
+
+
+def find_small_frame(
+    model: ArmModel, recordings: Sequence[Recording]
+) -> tuple[SetupFault, float] | None:
+    """A small change of the frame that explains the error of a model, and what it leaves [mm].
+
+    It is within the plausible range of the effect `misalignment`, so that it is no set-up fault:
+    `diagnose` tells it from the other effects. None where it explains less than a fault has to.
+    """
+    measured = [r for r in recordings if np.isfinite(r.key_points_mm).any()]
+    if not measured or not has_slope(model):
+        return None
+    search = _search(model, measured, _levels(model, measured))
+    start = search.start
+    if start.hypothesis.frame != "small" or not search.explains(search.raw.rmse_mm, start.rmse_mm):
+        return None
+    return frame_fault(start, start.frame), start.rmse_mm
 
 
 def _called(recordings: Sequence[Recording]) -> list[str]:

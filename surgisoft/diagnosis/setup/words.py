@@ -63,7 +63,7 @@ def faults_of(given: Fitted, frame: Frame, unit: str, mistake: tuple[str, str]) 
         ),
         "key_points": lambda: _key_points(given.hypothesis.points),
         "length_unit": lambda: _length(given.hypothesis.mm_per_unit),
-        "frame": lambda: _frame(given, frame),
+        "frame": lambda: frame_fault(given, frame),
         "time": lambda: _time(given),
     }
     kinds: tuple[Kind, ...] = given.hypothesis.kinds
@@ -151,7 +151,8 @@ def _unit(what: str, factor: float, mistake: tuple[str, str] | None, unit: str, 
     return f"{what} {wrong}: {true} were read as {read}{converted}"
 
 
-def _frame(given: Fitted, frame: Frame) -> SetupFault:
+def frame_fault(given: Fitted, frame: Frame) -> SetupFault:
+    """The fault that the key points are in another frame; frame: as it will be corrected."""
     turn_sd, shift_sd = given.turn_and_shift_errors()
     rotation, scale = frame.rotation, float(frame.scale)
     shift = frame.shift / scale

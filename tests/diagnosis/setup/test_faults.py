@@ -8,9 +8,10 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from surgisoft.diagnosis.diagnose import diagnose
-from surgisoft.diagnosis.setup import find_setup_faults
+from surgisoft.diagnosis.setup import find_setup_faults, find_small_frame
 from surgisoft.surrogate.checkpoint import default_arm
 from tests.diagnosis.setup.recordings import (
+    NOISE_MM,
     STEP_S,
     driven,
     in_time,
@@ -258,3 +259,18 @@ def test_tendons_in_another_unit_of_length_are_found(by, said):
     assert said in found.sentence
     (corrected,) = found.corrected([wrong])
     np.testing.assert_allclose(corrected.measured, right.measured, rtol=1e-9)
+
+
+def test_a_small_change_of_the_frame_is_told_apart_from_no_explanation(model):
+    """A camera that was bumped is no set-up fault, but it explains the error; a gain does not."""
+    vector, shift = np.array([0.03, -0.04, 0.02]), np.array([8.0, -5.0, 2.0])
+    bumped = turned(measured(), vector, shift)
+    assert find_setup_faults(model, [bumped]) is None
+    fault, left_mm = find_small_frame(model, [bumped])
+    expected = np.degrees(np.linalg.norm(vector))
+    assert fault.numbers["turn_deg"] == pytest.approx(expected, abs=0.05)
+    np.testing.assert_allclose(fault.numbers["shift_mm"], shift, atol=0.1)
+    assert left_mm == pytest.approx(np.sqrt(3) * NOISE_MM, rel=0.1)
+    for name in ("nothing", "a gain of 7 %", "a lag of 0.6 s"):
+        assert find_small_frame(model, [PHYSICS[name](measured())]) is None
+    assert find_small_frame(model, [SINGLE["mirrored"][0](measured())]) is None

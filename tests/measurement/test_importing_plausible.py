@@ -19,7 +19,7 @@ def recording(scale: float = 1.0, reverse: bool = False, length_mm: float | None
     return Recording(
         name="arm",
         t_s=t,
-        measured=np.sin(t)[:, None],
+        measured=30.0 * np.sin(t)[:, None],
         key_points_mm=scale * points,
         arm=ArmInfo(length_mm=length_mm),
     )
@@ -42,6 +42,24 @@ def test_a_length_that_contradicts_the_arm(scale, unit, proposed):
 def test_a_length_that_no_unit_explains():
     (note,) = plausibility_notes(replace(recording(), arm=ArmInfo(1100.0)), "mm")
     assert "check unit and scale" in note or 'unit = "cm"' in note
+
+
+@pytest.mark.parametrize(
+    ("by", "unit", "proposed"),
+    [(0.01, "kPa", "bar"), (1e-3, "kPa", "MPa"), (1e3, "kPa", "Pa"), (0.145, "psi", None)],
+)
+def test_pressures_that_no_arm_moves_at(by, unit, proposed):
+    """60 kPa in another unit read as kPa; 8.7 psi are 60 kPa."""
+    right = recording()
+    notes = plausibility_notes(replace(right, measured=by * right.measured, unit=unit), "mm")
+    if proposed is None:
+        assert notes == []
+        return
+    assert f'if the values are in {proposed}, set unit = "{proposed}" in [measured]' in notes[0]
+    assert f"moves by {np.ptp(by * right.measured):.3g} kPa at most" in notes[0]
+    resting = replace(right, measured=by * right.measured, unit=unit)
+    resting = replace(resting, key_points_mm=right.key_points_mm[:1].repeat(300, axis=0))
+    assert plausibility_notes(resting, "mm") == []
 
 
 def test_reversed_key_points():

@@ -14,7 +14,9 @@ from surgisoft.measurement.recordings.clock import (
     usual_step_s,
 )
 from surgisoft.measurement.recordings.columns import MM_PER
-from surgisoft.measurement.units import PLURAL, SECONDS_PER, unit_mistakes
+from surgisoft.measurement.recordings.quality import largest_motion
+from surgisoft.measurement.units import PLURAL, SECONDS_PER, factor, unit_mistakes
+from surgisoft.surrogate.units import KPA_PER
 
 LARGEST_RATIO = 2.0
 """Key points that span more than this multiple of the arm's length are in a wrong unit."""
@@ -46,6 +48,15 @@ SPREAD = (0.05, 0.95)
 """Quantiles between which values lie whose spread is compared [-]."""
 SAME_RATIO = 0.05
 """Largest difference, as a share, of that ratio from the one of two units, in every channel [-]."""
+USUAL_KPA = (2.0, 10_000.0)
+"""Range of the pressure of the channel that is driven most, of an arm that moves: films on the one
+side and hydraulic muscles on the other are near its ends [kPa]."""
+TYPICAL_KPA = 100.0
+"""The unit in which that range is nearest to this one, by ratio, is proposed [kPa]."""
+MISTAKEN = ("Pa", "mbar", "psi", "bar", "MPa", "kPa")
+"""Units that are proposed."""
+LEAST_MOTION = 0.1
+"""Least motion of a key point, as a share of the arm's length, of an arm that is driven [-]."""
 MOST_ROWS = 6000
 """Rows, evenly over the recording, whose measured actuation is compared with the commands: they
 determine a correlation of 0.9 to within 0.01 (a count)."""
@@ -64,6 +75,26 @@ def plausibility_notes(
         *_order(recording),
         *_step(recording, time_unit),
         *_channels(recording),
+        *_pressure(recording),
+    ]
+
+
+def _pressure(recording: Recording) -> list[str]:
+    """A note where an arm moves at pressures that are those of another unit."""
+    by = factor(recording.unit, "kPa")
+    span = float(np.ptp(recording.measured, axis=0).max())
+    _, moved_mm, length_mm = largest_motion([recording])
+    if by is None or span == 0.0 or not length_mm or moved_mm < LEAST_MOTION * length_mm:
+        return []
+    low, high = USUAL_KPA
+    if low <= by * span <= high:
+        return []
+    others = [unit for unit in MISTAKEN if unit != recording.unit]
+    near = min(others, key=lambda unit: abs(np.log(KPA_PER[unit] * span / TYPICAL_KPA)))
+    return [
+        f"the actuation moves by {span:.3g} {recording.unit} at most, expected {low:g} to "
+        f"{high:g} kPa of an arm that moves: if the values are in {near}, set unit = "
+        f'"{near}" in [measured] and [commanded] of the map'
     ]
 
 

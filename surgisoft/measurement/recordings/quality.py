@@ -88,14 +88,30 @@ def find_warnings(recording: Recording) -> list[QualityWarning]:
 def moves_alone(recordings: list[Recording]) -> str:
     """In words, that the body moves while all actuation keeps its value in every row; else empty.
 
-    The motion is that of the key point that moves most, compared with the length of the arm or,
-    where it is not stated, with the distance between its first and last key point.
+    The motion is compared with the length of the arm (`largest_motion`).
     """
     signal = np.concatenate([recording.measured for recording in recordings])
     if len(signal) < LEAST_FROZEN_ROWS or (signal != signal[0]).any():
         return ""
     if any(ranges.any() for recording in recordings for _, ranges in recording.actuation_ranges):
         return ""
+    most, moved_mm, length_mm = largest_motion(recordings)
+    if not length_mm or moved_mm < ALONE_SHARE * length_mm:
+        return ""
+    values = ", ".join(f"{value:.4g}" for value in signal[0])
+    return (
+        f"no channel of the actuation moves ({values} {recordings[0].unit} in every row), while "
+        f"key point k{most} moves by {moved_mm:.3g} mm: check the log, and the columns of "
+        "[measured] in the map"
+    )
+
+
+def largest_motion(recordings: list[Recording]) -> tuple[int, float, float | None]:
+    """The key point that moves most, its motion [mm], and the length of the arm [mm], if known.
+
+    The motion is the diagonal of the box between `MOTION_QUANTILES` of its coordinates. The length
+    is the stated one, or the distance between the first and the last key point.
+    """
     points = np.concatenate([recording.key_points_mm for recording in recordings])
     known = ~np.isnan(points).any(axis=2)
     moved = [
@@ -111,14 +127,7 @@ def moves_alone(recordings: list[Recording]) -> str:
     if length is None and both.any():
         length = float(np.median(np.linalg.norm(points[both, -1] - points[both, 0], axis=1)))
     most = int(np.argmax(moved))
-    if not length or moved[most] < ALONE_SHARE * length:
-        return ""
-    values = ", ".join(f"{value:.4g}" for value in signal[0])
-    return (
-        f"no channel of the actuation moves ({values} {recordings[0].unit} in every row), while "
-        f"key point k{most} moves by {moved[most]:.3g} mm: check the log, and the columns of "
-        "[measured] in the map"
-    )
+    return most, moved[most], length
 
 
 # --- copies -------------------------------------------------------------------------------------

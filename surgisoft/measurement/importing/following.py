@@ -159,9 +159,10 @@ def warnings_of(found: Following | None, delays_s: Mapping[str, float]) -> list[
         how = "late" if found.shift_s > 0 else "early"
         as_it_is = f", and {_percent(found.explained)} as the times are"
         if found.shift_s > 0 and found.explained > EXPLAINED:
-            as_it_is = ", and at most half of what is left behind a lag"
+            as_it_is = ", and a lag leaves at least twice as much of it"
         return [
-            f"the key points follow the actuation {abs(found.shift_s):.3g} s {how} "
+            f"the key points follow the actuation {abs(found.shift_s):.3g} s {how}, with the arm's "
+            "own lag "
             f"({found.shifted:.0%} of their motion is explained then{as_it_is}): if the clocks of "
             f"the files are apart, {set_delay(delays_s, -found.shift_s, '.3g')}"
         ]

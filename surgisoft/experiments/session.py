@@ -298,7 +298,8 @@ def weak_lasers(spec: Experiment) -> list[str]:
     different: dict[Any, Setting] = {}
     for setting in settings(spec):
         values = tuple((name, value) for name, value in setting.values if name[:5] == "task.")
-        different.setdefault((setting.lesion, values), replace(setting, values=values))
+        place = scene_folder(spec, setting.case)
+        different.setdefault((place, setting.lesion, values), replace(setting, values=values))
     found = []
     for setting in different.values():
         simulated = replace(setting, case=replace(setting.case, plant="simulation"))

@@ -136,6 +136,12 @@ def test_the_commands_warn_of_a_weak_laser(tmp_path, capsys):
         "surgisoft: warning: setting 'simulation_cut_s=45': the beam of 0.5 W"
     )
 
+    cases = f'[[cases]]\nname = "strong"\n[[cases]]\nname = "weak"\nscene = "{place}"\n'
+    text = TINY.replace("{scene}", str(PHANTOM)).replace("time_s = 0.5", "time_s = 60.0")
+    assert run(["experiment", "check", str(write(tmp_path, text + cases))]) == 0
+    said = [line for line in capsys.readouterr().err.splitlines() if "J/mm2" in line]
+    assert [line.split("'")[1] for line in said] == ["weak"]
+
     told = []
     config = CircleAblationConfig(scene=place, world=WorldConfig(dt_s=1.0))
     evaluate("random", "circle_ablation", config=config, episodes=1, exact_checks=False,

@@ -40,7 +40,7 @@ Function = Callable[[Arrays], list]
 """Input arrays by name in, output arrays in the order of `policy.json` out."""
 
 
-MOST_PERIODS = 10.0
+MOST_PERIODS = 20.0
 """Longest time between two samples of an episode, in control periods. After a longer one the arm
 has moved on without decisions, and the policy would go on as if it had not."""
 BEYOND = 1e-3

@@ -150,8 +150,11 @@ class Comparison:
     @property
     def of_another_arm(self) -> bool:
         """Whether the model leaves so much of the motion that it does not describe this arm, and no
-        fault of the set-up is proved. What the error depends on then says nothing."""
-        return self.of_arm is not None and not self.of_arm.fits and self.setup is None
+        fault of the set-up is proved. What the error depends on then says nothing. With recordings
+        from before the arm is known to be the model's, and has changed."""
+        if self.of_arm is None or self.change is not None or self.setup is not None:
+            return False
+        return not self.of_arm.fits
 
     @property
     def explainable(self) -> float | None:
@@ -196,7 +199,8 @@ class Comparison:
         if self.of_another_arm and self.of_arm is not None:
             return (
                 f"{text}: the model does not describe this arm's motion of "
-                f"{_mm(self.of_arm.motion_mm)}: {WHOSE_ARM}"
+                f"{_mm(self.of_arm.motion_mm)}: {WHOSE_ARM}; or one effect changes most of the "
+                "motion, which diagnose tells"
             )
         if self.best_achievable is None or self.open_rmse_mm is None:
             return f"{text}; too few rows to say what it depends on"

@@ -16,7 +16,7 @@ from surgisoft.measurement.histories import (
     outside_range,
 )
 from surgisoft.measurement.recordings import Recording, load_recordings
-from surgisoft.measurement.recordings.quality import moves_alone
+from surgisoft.measurement.recordings.quality import context_varies, moves_alone
 from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.effects import check_user_effects
 from surgisoft.surrogate.fitted_rows import Seen
@@ -48,7 +48,7 @@ def open_inputs(
     arm = load_model(model)
     measured = load_recordings(recordings)
     check_fits(arm.spec, measured, sized)
-    if alone := moves_alone(measured):
+    if (alone := moves_alone(measured)) and not any(map(context_varies, measured)):
         raise InputError(f"{measured[0].label}: {alone}, and import again")
     if tried:
         check_user_effects(arm.facts, tried=True)

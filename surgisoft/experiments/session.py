@@ -35,6 +35,8 @@ from surgisoft.tasks.world.reach import beam_beyond_limits
 
 PACKAGED = PHANTOM / "experiments"
 """The experiments that come with the package."""
+MOST_LASERS = 20
+"""Most settings whose laser is compared with the dose that is needed, 0.1 to 1.5 s each."""
 REPLAY_PICTURES_HZ = 1.0
 """Endoscope pictures in a second of the replays beside a report, 1/s."""
 
@@ -291,7 +293,10 @@ def beams_beyond_limits(spec: Experiment) -> list[str]:
 
 def weak_lasers(spec: Experiment) -> list[str]:
     """See `weak_laser`: one line for each different task whose beam, in the phases that have one,
-    is too weak to treat what a success needs."""
+    is too weak to treat what a success needs.
+
+    Of many settings `MOST_LASERS` are looked at, evenly; equal lines are one.
+    """
     beam_s = sum(phase.timeout_s for phase in spec.phases if phase.beam)
     if not spec.in_scene or not beam_s:
         return []
@@ -300,15 +305,20 @@ def weak_lasers(spec: Experiment) -> list[str]:
         values = tuple((name, value) for name, value in setting.values if name[:5] == "task.")
         place = scene_folder(spec, setting.case)
         different.setdefault((place, setting.lesion, values), replace(setting, values=values))
-    found = []
-    for setting in different.values():
+    said: dict[str, list[str]] = {}
+    number = -(-len(different) // MOST_LASERS)
+    for setting in list(different.values())[::number]:
         simulated = replace(setting, case=replace(setting.case, plant="simulation"))
         try:
             base = build_task(spec, simulated, on_warning=None).base
         except InputError:  # the run names the setting
             continue
         if weak := weak_laser(base, min(beam_s, spec.limits.time_s)):
-            found.append(f"setting '{setting.label}': {weak}" if len(different) > 1 else weak)
+            said.setdefault(weak, []).append(setting.label)
+    found = []
+    for weak, labels in said.items():
+        more = f" and {len(labels) - 1} more" if len(labels) > 1 else ""
+        found.append(f"setting '{labels[0]}'{more}: {weak}" if len(different) > 1 else weak)
     return found
 
 

@@ -4,7 +4,7 @@ import itertools
 import math
 
 from surgisoft.config import Where
-from surgisoft.surrogate.units import DEGREES_PER, KPA_PER, MM_PER
+from surgisoft.units import DEGREES_PER, KPA_PER, MM_PER
 
 SECONDS_PER = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 """Seconds in each unit of time."""

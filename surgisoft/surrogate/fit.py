@@ -10,7 +10,7 @@ does not show what a small reversal does.
 import copy
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from numbers import Integral, Real
 from typing import Any
@@ -545,7 +545,7 @@ def _finish(data: Data, result: FitResult) -> None:
     for number, value in enumerate(validation.per_key_point_mm):
         if value is None:
             result.warnings.append(f"key point k{number} is missing in all held-out rows")
-    result.warnings += _left_unexplained(validation, train if valid is None else valid)
+    result.warnings += _left_unexplained(validation, [train] if valid is None else [train, valid])
     result.model.eval().requires_grad_(False)
     result.known = result.model.residuals_on([train] if valid is None else [train, valid])
     result.model.training_residuals = result.known
@@ -555,13 +555,14 @@ def _finish(data: Data, result: FitResult) -> None:
     result.model.fitted_rows = known
 
 
-def _left_unexplained(validation: Validation, judged: History) -> list[str]:
+def _left_unexplained(validation: Validation, seen: Sequence[History]) -> list[str]:
     """A note where a model leaves more of the motion than any model of the arm should.
 
-    Its error, less the noise of the key points, is compared with their motion in `judged`.
+    Its error, less the noise of the key points, is compared with their motion where it is largest:
+    held-out rows may be near one posture.
     """
-    points = judged.rows(judged.key_points)
-    motion = _rmse((points - points.nanmean(0)).square())
+    points = [history.rows(history.key_points) for history in seen]
+    motion = max(_rmse((each - each.nanmean(0)).square()) for each in points)
     error, noise = validation.rmse_mm or 0.0, math.sqrt(3.0) * (validation.noise_mm or 0.0)
     if math.sqrt(max(error**2 - noise**2, 0.0)) <= LEFT_OF_MOTION * motion:
         return []

@@ -209,7 +209,8 @@ def task_of(task: str | Task, device: str | torch.device = "cpu", **changes: Any
         return make_with(task, device=device, **changes)
     if not hasattr(task, "world"):
         raise InputError(
-            f"task is of type {type(task).__name__}, expected the name of a task or a task"
+            f"task is of type {type(task).__name__}, expected the name of a task or a task; "
+            "check the order of the arguments"
         )
     beside = [name for name in changes if name != "geometry" and changes[name] is not None]
     if beside:

@@ -39,6 +39,7 @@ def driven():
         "episode_steps": 3,
         "controller": {
             "arms": [arm],
+            "control_period_s": 0.1,
             "state": {"leaves": leaves, "initial": [0.0, 0.25, 0.0, 5.0, 60.0, 50.0]},
             "signals": [],
             "goal": [{**leaves[1], "default": 0.25}],
@@ -121,14 +122,39 @@ def signalled():
         for name in ("one", "two")
     ]
     signals = [
-        {"name": "view", "meaning": "share seen", "default": None, "optional": False},
-        {"name": "at_target", "meaning": "1 at the target", "default": None, "optional": True},
-        {"name": "out_mm", "meaning": "the feed", "default": 2.5, "optional": False},
+        {
+            "name": "view",
+            "unit": "-",
+            "low": 0.0,
+            "high": 1.0,
+            "meaning": "share seen",
+            "default": None,
+            "optional": False,
+        },
+        {
+            "name": "at_target",
+            "unit": "-",
+            "low": 0.0,
+            "high": 1.0,
+            "meaning": "1 at the target",
+            "default": None,
+            "optional": True,
+        },
+        {
+            "name": "out_mm",
+            "unit": "mm",
+            "low": -9.0,
+            "high": 9.0,
+            "meaning": "the feed",
+            "default": 2.5,
+            "optional": False,
+        },
     ]
     about = {
         "episode_steps": 3,
         "controller": {
             "arms": arms,
+            "control_period_s": 0.1,
             "state": {"leaves": [], "initial": [0.0]},
             "signals": signals,
             "goal": [],

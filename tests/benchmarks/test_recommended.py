@@ -66,7 +66,7 @@ def test_the_table_by_hand():
 class Bench:
     """A robot that records set points without noise, and remembers what it was asked for."""
 
-    period_s, limits = 0.1, np.array([[0.0, 40.0]])
+    period_s, limits, unit = 0.1, np.array([[0.0, 40.0]]), "kPa"
     asked: ClassVar[list] = []
 
     def __init__(self, robot, take, hidden):

@@ -61,7 +61,11 @@ def test_compare_says_that_a_model_does_not_describe_an_arm(model, tmp_path, cap
     )
     assert "explainable" not in away.sentence
     assert "depends" not in away.sentence
+    assert "or one effect changes most of the motion" in away.sentence
     assert not replace(away, setup="a wrong unit").of_another_arm
+    shifted = with_points(whole, whole.key_points_mm + np.array([0.4 * motion, 0.0, 0.0]))
+    since, _ = compare(model, [shifted], before=[whole])
+    assert not since.of_another_arm, "it is the arm of the model, and has changed"
     moved = with_points(whole, whole.key_points_mm + np.array([0.4 * motion, 0.0, 0.0]))
     save_recording(moved, tmp_path / "away.parquet")
     assert run(["compare", "default", str(tmp_path / "away.parquet")]) == 0

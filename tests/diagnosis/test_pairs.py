@@ -977,7 +977,7 @@ def test_recordings_and_reference_are_before(model):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"measured": np.zeros((ROWS, 3))}, "chambers: 3"),
+        ({"measured": np.linspace(0.0, 20.0, 3 * ROWS).reshape(ROWS, 3)}, "chambers: 3"),
         ({"key_points_mm": made(walk_of_time, 0.0).key_points_mm[:, 1:]}, "key points: 2"),
         ({"unit": "psi"}, "unit: psi"),
         ({"measured": 20.0 + walk(ROWS)}, "no common actuation"),

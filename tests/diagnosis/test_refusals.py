@@ -66,6 +66,11 @@ def test_a_body_that_moves_without_actuation_is_refused():
         text = refusal(lambda asked=asked: asked(still_model(), [dead]))
         assert "no channel of the actuation moves (2, 2 kPa in every row)" in text
         assert "and import again" in text
+    hung = replace(dead, payload_g=np.where(np.arange(ROWS) < ROWS // 2, 0.0, 50.0))
+    assert np.isfinite(compare(still_model(), [hung])[0].rmse_mm), "a load moves it"
+    plain = replace(some(), measured=dead.measured, commanded=None)
+    at_rest = [plain, replace(plain, name="turned", key_points_mm=plain.key_points_mm + 50.0)]
+    assert np.isfinite(compare(still_model(), at_rest)[0].rmse_mm), "no body moves in any of them"
 
 
 def test_held_out_rows_are_opened_once():

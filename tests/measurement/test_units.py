@@ -3,7 +3,7 @@
 import pytest
 
 from surgisoft.measurement.units import SECONDS_PER, factor, same_unit, unit_mistakes, unit_named
-from surgisoft.surrogate.units import MM_PER
+from surgisoft.units import MM_PER
 
 VALUES = [
     ("in", "mm", 25.4),

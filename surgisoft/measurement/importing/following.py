@@ -8,7 +8,7 @@ The best one says what share the actuation explains: much of it on usual arms, n
 files were mixed up. A small share is no proof: an arm may depend on its actuation in another way.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -88,6 +88,11 @@ class Following:
     """Whether no lag explains as much as that shift, so that clocks are apart."""
 
 
+FALLEN, REPEATED = 0.5, 0.9
+"""Autocorrelations of an actuation: below the first it is another one, from the second on it has
+come again (a sine without noise reaches 1)."""
+
+
 def following(recording: Recording) -> Following | None:
     """How much the actuation explains; None where the recording cannot show it.
 
@@ -119,7 +124,8 @@ def _apart(moves: Moves, explained: float, shifted: float, shift_s: float) -> bo
     """Whether body and actuation are apart by this time, and not by a lag.
 
     explained: the largest share at a usual shift; shifted: the share at this one. A clock delays
-    fast and slow motion alike, a lag spreads it. No lag moves the body first.
+    fast and slow motion alike, a lag spreads it. No lag moves the body first. Where the actuation
+    repeats itself, a time is as good as one that is a period later.
     """
     shift = shift_s / moves.step_s
     if shifted < LEAST_DEAD or abs(shift_s) < LEAST_DEAD_S:
@@ -127,6 +133,8 @@ def _apart(moves: Moves, explained: float, shifted: float, shift_s: float) -> bo
     if shift < 0:
         causal = 1 - max(explained, _behind_lags(moves))
         return causal >= LEAST_LEFT and 1 - shifted <= HALVED * causal
+    if repeats(moves.actuation):
+        return False
     most = round(shift)
     pure = moves.errors_at(most, most, moves.longest)
     for share in LAG_SHARES:
@@ -141,6 +149,24 @@ def _apart(moves: Moves, explained: float, shifted: float, shift_s: float) -> bo
                 if gain.mean() < LEAST_T * gain.std(ddof=1) / np.sqrt(len(gain)):
                     return False
     return True
+
+
+def repeats(actuation: Sequence[np.ndarray]) -> bool:
+    """Whether an actuation, each run's (G, m), nearly comes again at a later time, as a periodic
+    one does: its autocorrelation, once it has fallen below `FALLEN`, is `REPEATED` or more."""
+    for run in actuation:
+        x = run - run.mean(axis=0)
+        count = len(x)
+        spectrum = np.fft.rfft(x, 2 * count, axis=0)
+        product = np.fft.irfft(np.square(np.abs(spectrum)).sum(axis=1))[: count // 2]
+        energy = np.concatenate([[0.0], np.cumsum(np.square(x).sum(axis=1))])
+        later = np.arange(len(product))
+        size = np.sqrt(energy[count - later] * (energy[-1] - energy[later]))
+        alike = product / np.maximum(size, 1e-12)
+        fallen = np.flatnonzero(alike < FALLEN)
+        if len(fallen) and alike[fallen[0] :].max() >= REPEATED:
+            return True
+    return False
 
 
 def following_warnings(recording: Recording, delays_s: Mapping[str, float]) -> list[str]:

@@ -16,7 +16,7 @@ from surgisoft.measurement.recordings.clock import (
 from surgisoft.measurement.recordings.columns import MM_PER
 from surgisoft.measurement.recordings.quality import largest_motion
 from surgisoft.measurement.units import PLURAL, SECONDS_PER, factor, unit_mistakes
-from surgisoft.surrogate.units import KPA_PER
+from surgisoft.units import KPA_PER
 
 LARGEST_RATIO = 2.0
 """Key points that span more than this multiple of the arm's length are in a wrong unit."""
@@ -62,6 +62,11 @@ MOST_ROWS = 6000
 determine a correlation of 0.9 to within 0.01 (a count)."""
 
 
+HELD = 10.0
+"""A pressure that varies by less than its largest value over this is held, and says nothing of its
+unit: an arm that moves then is moved by something else."""
+
+
 def plausibility_notes(
     recording: Recording, unit: str | None, time_unit: str | None = None
 ) -> list[str]:
@@ -87,7 +92,8 @@ def _pressure(recording: Recording) -> list[str]:
     if by is None or span == 0.0 or not length_mm or moved_mm < LEAST_MOTION * length_mm:
         return []
     low, high = USUAL_KPA
-    if low <= by * span <= high:
+    held = float(np.abs(recording.measured).max()) > HELD * span
+    if low <= by * span <= high or held:
         return []
     others = [unit for unit in MISTAKEN if unit != recording.unit]
     near = min(others, key=lambda unit: abs(np.log(KPA_PER[unit] * span / TYPICAL_KPA)))

@@ -4,7 +4,7 @@ import re
 from dataclasses import dataclass
 
 from surgisoft.errors import InputError
-from surgisoft.surrogate.units import MM_PER
+from surgisoft.units import MM_PER
 
 _UNIT = r"([A-Za-z%][A-Za-z0-9%]*)"
 _ACTUATION = re.compile(rf"([pc])([1-9][0-9]{{0,5}})_{_UNIT}")

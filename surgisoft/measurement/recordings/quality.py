@@ -95,7 +95,9 @@ def moves_alone(recordings: list[Recording]) -> str:
         return ""
     if any(ranges.any() for recording in recordings for _, ranges in recording.actuation_ranges):
         return ""
-    most, moved_mm, length_mm = largest_motion(recordings)
+    most, moved_mm, length_mm = max(
+        (largest_motion([recording]) for recording in recordings), key=lambda found: found[1]
+    )
     if not length_mm or moved_mm < ALONE_SHARE * length_mm:
         return ""
     values = ", ".join(f"{value:.4g}" for value in signal[0])
@@ -103,6 +105,16 @@ def moves_alone(recordings: list[Recording]) -> str:
         f"no channel of the actuation moves ({values} {recordings[0].unit} in every row), while "
         f"key point k{most} moves by {moved_mm:.3g} mm: check the log, and the columns of "
         "[measured] in the map"
+    )
+
+
+def context_varies(recording: Recording) -> bool:
+    """Whether a stated load or temperature varies, which moves an arm at constant pressure."""
+    stated = (recording.payload_g, recording.temp_C)
+    return any(
+        np.ptp(values[known]) > 0.0
+        for values in stated
+        if values is not None and (known := np.isfinite(values)).any()
     )
 
 

@@ -32,7 +32,7 @@ from surgisoft.surrogate.effects.base import (
 from surgisoft.surrogate.effects.hypothesis import Hypothesis
 from surgisoft.surrogate.effects.readings import Reading, duration
 from surgisoft.surrogate.scan import linear_scan
-from surgisoft.surrogate.units import is_displacement
+from surgisoft.units import is_displacement
 
 TIMES = torch.logspace(-0.45, 2.55, 11, dtype=torch.float64)
 """(K,) retardation times, 0.35 to 350 s, a factor of 2 apart."""

@@ -22,7 +22,6 @@ from surgisoft.surrogate.arm import ArmSpec, ArmState
 from surgisoft.surrogate.backbone import LEAST_SINE, STRAIGHT_RAD, ArcBackbone, Backbone
 from surgisoft.surrogate.compiled_step import CompiledStep
 from surgisoft.surrogate.model import ArmModel
-from surgisoft.surrogate.units import KPA_PER
 from surgisoft.tasks.world.adaptation import AdaptationPrior, DisturbanceEstimator
 from surgisoft.tasks.world.arm_errors import ErrorPrior
 from surgisoft.tasks.world.compiled_arm import draw_arc, draw_body, drive, place
@@ -30,6 +29,7 @@ from surgisoft.tasks.world.observer import AlphaBetaFilter, Belief
 from surgisoft.tasks.world.random_effects import RandomEffects
 from surgisoft.tasks.world.random_streams import Stream
 from surgisoft.threads import over_rows
+from surgisoft.units import KPA_PER
 
 STOOD = 40
 """Measurements at each pressure before an episode from which the observer learns, where it adapts:

@@ -248,7 +248,7 @@ def test_the_example_of_the_page_drives_the_controller(ring, monkeypatch):
 
 
 def test_signals_and_times_out_of_range_are_refused(ring):
-    """A share of 5 (in per cent, perhaps), and 2 s without a sample, of which one decision came."""
+    """A share of 5 (in per cent, perhaps), and 3 s without a sample, of which one decision came."""
     policy, task, _ = ring
     made = running(ControllerGraph(task, policy.actors))
     points = {name: arm.model.rest_mm.numpy() for name, arm in task.world.arms.items()}
@@ -257,8 +257,8 @@ def test_signals_and_times_out_of_range_are_refused(ring):
     for wrong in (5.0, -0.1):
         with pytest.raises(ValueError, match=f"'view_fraction' is {wrong:g}, expected 0 to 1: "):
             made.step(rest, points, 0.1, view_fraction=wrong, beam_on=0.0)
-    with pytest.raises(ValueError, match=r"dt_s is 2 s, expected at most 1 s within an episode"):
-        made.step(rest, points, 2.0, view_fraction=1.0, beam_on=0.0)
+    with pytest.raises(ValueError, match=r"dt_s is 3 s, expected at most 2 s within an episode"):
+        made.step(rest, points, 3.0, view_fraction=1.0, beam_on=0.0)
     made.step(rest, points, 1.0, view_fraction=1.0, beam_on=1.0)
     assert made.steps == 1
 

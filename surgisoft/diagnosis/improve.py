@@ -10,10 +10,10 @@ With recordings from before a change, every round diagnoses and amends that chan
 difference, of which the given model predicts BEFORE in all rounds, or the model's residuals less
 what of those on BEFORE can be learned. The network, which was fitted to neither, stays as it is.
 """
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from numbers import Integral
 
 from surgisoft.diagnosis.amend import Fall, Track, errs_more, fall_of, of_change, track_of
 from surgisoft.diagnosis.amended_error import state_error, state_residuals
@@ -272,7 +272,7 @@ def improve(
     are paired, errors are those of the paired difference, and `Improvement.model_error` is that of
     the model itself.
     """
-    if not isinstance(most_effects, int):
+    if not isinstance(most_effects, Integral):
         raise wrong_type("the largest number of effects", most_effects, "an integer")
     if most_effects < 1:
         raise InputError(f"largest number of effects is {most_effects}, expected 1 or more")

@@ -190,10 +190,10 @@ class BatchedEnv(VectorEnv):
         scene: str | Path | None = None,
         arm: str | Path | None = None,
         geometry: str | None = None,
-        render_mode: str | None = None,
         agent: str | None = None,
         images: str | None = None,
         image_pixels: int | None = None,
+        render_mode: str | None = None,
     ):
         """The task's name, and changes to its config as for `registry.make_with`; or a task.
 

@@ -232,7 +232,7 @@ def test_the_loop_ends_when_an_effect_is_named_again_or_enough_were_added(recite
     again = improve(bare_arm(), [recording])
     assert [name for name, _ in again.steps] == ["creep"]
     recited(said("ambiguous", "creep", "drift"))
-    once = improve(bare_arm(), [recording], most_effects=1)
+    once = improve(bare_arm(), [recording], most_effects=np.int64(1))
     assert [name for name, _ in once.steps] == ["creep"]
     assert once.rounds[0].competing == ("drift",)
     with pytest.raises(InputError, match="expected 1 or more"):

@@ -10,6 +10,7 @@ With recordings from before a change, every round diagnoses and amends that chan
 difference, of which the given model predicts BEFORE in all rounds, or the model's residuals less
 what of those on BEFORE can be learned. The network, which was fitted to neither, stays as it is.
 """
+
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace

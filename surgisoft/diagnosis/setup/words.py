@@ -235,14 +235,15 @@ def _time(given: Fitted) -> SetupFault:
     numbers: dict[str, float | list] = {"late_s": late, "hidden_lag_s": lag}
     better = ""
     if likelier:
-        numbers |= {"likelier_lag_s": likelier, "likelier_late_s": given.likelier_later_s}
+        beside = given.likelier_later_s
+        numbers |= {"likelier_lag_s": likelier, "likelier_late_s": beside}
         better = (
-            f"{abs(given.likelier_later_s):.2f} s and a lag that has grown by {likelier:.2f} s "
-            "since the fit leave less error; "
+            f"{abs(beside):.2f} s {'late' if beside > 0 else 'early'} and a lag that has grown by "
+            f"{likelier:.2f} s since the fit leave less error; "
         )
     if lag >= LEAST_HIDDEN_LAG_S:
         text += (
-            f" ({better}a lag that has changed by up to {lag:.2f} s would look the same: one "
-            "trigger for both logs tells)"
+            f" ({better}a lag that has changed by up to {lag:.2f} s would look the same: to "
+            "tell them apart, start both logs by one trigger)"
         )
     return SetupFault("time", text, numbers, {"late_s": spread})

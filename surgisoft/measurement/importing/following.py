@@ -88,9 +88,10 @@ class Following:
     """Whether no lag explains as much as that shift, so that clocks are apart."""
 
 
-FALLEN, REPEATED = 0.5, 0.9
-"""Autocorrelations of an actuation: below the first it is another one, from the second on it has
-come again (a sine without noise reaches 1)."""
+FALLEN = 0.5
+"""Autocorrelation below which an actuation is another one than at first [-]."""
+REPEATED = 0.9
+"""Autocorrelation from which it has come again after that; a sine without noise reaches 1 [-]."""
 
 
 def following(recording: Recording) -> Following | None:

@@ -118,11 +118,11 @@ class Creep(Effect):
 
     def quantities(self) -> list[Quantity]:
         """Amount, centre (s) and width of the spectrum, and the power of the load."""
-        moved = is_displacement(self.facts.unit)
-        why = "wide: at most as much again as at once" if not moved else "wide: at most all of it"
-        why += "; a solid does not creep backwards" if not moved else " is lost, or as much again"
+        low, why = 0.0, "wide: at most as much again as at once; a solid does not creep backwards"
+        if is_displacement(self.facts.unit):
+            low, why = -1.0, "wide: at most all of it is lost to relaxation, or as much again added"
         return [
-            Quantity("amount_share", value_of(self.amount), "", -1.0 if moved else 0.0, 1.0, why),
+            Quantity("amount_share", value_of(self.amount), "", low, 1.0, why),
             Quantity(
                 "tau_s",
                 value_of(self.log_tau.exp()),

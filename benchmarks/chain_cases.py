@@ -1,7 +1,7 @@
 """Cases for a diagnosis on chains of rigid links: robots with recordings before and after a change.
 
     python -m benchmarks.chain_cases FOLDER [--robots 600,601,...] [--count 87] [--seed 1]
-        [--pairs 0] [--unknown 0] [--processes 1]
+        [--pairs 0] [--unknown 0] [--later 0] [--processes 1]
 
 `benchmarks.rig_cases` describes the folder (such as runs/chain, outside git) and the plans, and
 `benchmarks.chain` the physics. Changes are drawn in mm for each 100 mm of the arm. `robot.json`

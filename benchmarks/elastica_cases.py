@@ -1,7 +1,7 @@
 """Cases for a diagnosis on the PyElastica rig: robots with recordings before and after a change.
 
     python -m benchmarks.elastica_cases FOLDER [--robots 101,102,...] [--count 100] [--seed 1]
-        [--pairs 0] [--unknown 0] [--processes 1]
+        [--pairs 0] [--unknown 0] [--later 0] [--processes 1]
 
 `benchmarks.rig_cases` describes the folder (such as runs/elastica, outside git) and the plans.
 """

@@ -84,6 +84,8 @@ class Setup:
     plant: Any
     """Parameters of the robot, a NamedTuple; their arrays are shared, and replaced, not written
     to."""
+    zero: np.ndarray | float = 0.0
+    """(m,) reading of each channel's sensor without actuation, over the upper limit [-]."""
 
     def change(self, **values) -> None:
         """Replace parameters of the robot."""
@@ -98,6 +100,14 @@ def misalignment(strength: float, length: float, rng: np.random.Generator) -> np
     """(6,) rotation [rad] and shift [m] of the cameras' frame beside an arm of a length [m]."""
     turn = 0.012 * strength * random_direction(rng)
     return np.concatenate([turn, 0.004 * strength * length * random_direction(rng)])
+
+
+def shift_zeros(setup: Setup, strength: float, chambers: int, rng: np.random.Generator) -> None:
+    """Sensors of two channels, or homes of two motors, whose zero has shifted."""
+    shift = np.zeros(chambers)
+    sizes = 0.04 * strength * np.array([1.0, rng.uniform(0.3, 1.0)])
+    shift[rng.permutation(chambers)[:2]] = sizes[:chambers] * rng.choice([-1.0, 1.0], 2)[:chambers]
+    setup.zero = shift
 
 
 def breath(strength: float, length: float, rng: np.random.Generator) -> np.ndarray:
@@ -194,14 +204,17 @@ class Bench:
         sizes: tuple[int, int],
         seeds: Sequence[int],
         noise: float,
+        zero: np.ndarray | float = 0.0,
     ) -> None:
         """The bench of a robot.
 
         high: upper limit of actuation [SI]; gravity: (3,) in any unit; sizes: chambers and key
-        points; seeds: of all noise; noise: factor on it.
+        points; seeds: of all noise; noise: factor on it; zero: (m,) reading of each channel's
+        sensor without actuation, over the upper limit, which its controller follows.
         """
         self._cameras, self._high, self._noise = robot.cameras, high, noise
         self._rng = np.random.default_rng(seeds)
+        self._low, self._zero = robot.low, high * zero
         self.chambers, self.key_planes = sizes
         self.period_s = robot.cameras.period_s
         self.limits = self.to_unit * np.tile([robot.low, high], (self.chambers, 1))
@@ -225,10 +238,11 @@ class Bench:
         times, parts, commanded = [], [], []
         for _, commands in runs_of(protocol, self.period_s):
             times.append(self.rest() + self.period_s * np.arange(1, len(commands) + 1))
-            parts.append(self.run(self.to_si * commands))
+            moved = self.run(np.maximum(self.to_si * commands - self._zero, self._low))
+            parts.append(moved._replace(measured=moved.measured + self._zero))
             commanded.append(commands)
-        moved = Moved(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-        return self._as_measured(protocol, np.concatenate(times), np.concatenate(commanded), moved)
+        whole = Moved(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        return self._as_measured(protocol, np.concatenate(times), np.concatenate(commanded), whole)
 
     def _as_measured(
         self, protocol: Schedule, t_s: np.ndarray, commanded: np.ndarray, moved: Moved

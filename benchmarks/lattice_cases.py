@@ -1,7 +1,7 @@
 """Cases for a diagnosis on lattices of springs: robots with recordings before and after a change.
 
     python -m benchmarks.lattice_cases FOLDER [--robots 700,701,...] [--count 87] [--seed 1]
-        [--pairs 0] [--unknown 0] [--processes 1]
+        [--pairs 0] [--unknown 0] [--later 0] [--processes 1]
 
 `benchmarks.rig_cases` describes the folder (such as runs/lattice, outside git) and the plans, and
 `benchmarks.lattice` the physics. Changes are drawn in mm for each 100 mm of the arm. `robot.json`

@@ -1,7 +1,7 @@
 """Cases for a diagnosis on arms in MuJoCo: robots with recordings before and after a change.
 
     python -m benchmarks.mujoco_cases FOLDER [--robots 800,801,...] [--count 87] [--seed 1]
-        [--pairs 0] [--unknown 0] [--processes 1]
+        [--pairs 0] [--unknown 0] [--later 0] [--processes 1]
 
 `benchmarks.rig_cases` describes the folder (such as runs/mujoco, outside git) and the plans, and
 `benchmarks.mujoco_arm` the physics. Changes are drawn in mm for each 100 mm of the arm.

@@ -13,7 +13,8 @@ Everything follows from the seeds, and what exists already is kept: a second cal
 cases come in rounds that hold every known effect, unknown ones, pairs and clean robots, so that any
 first part of them is balanced. `--pairs` and `--unknown` add cases of two effects, any two of the
 list that recordings can tell apart, and of unknown effects of more kinds; they have plans of their
-own, so that the rounds stay what they are. `--longer` is a factor on the durations of all
+own, so that the rounds stay what they are; so have those of `--later`, effects that were added to
+the list when many cases existed. `--longer` is a factor on the durations of all
 recordings. Strengths are chosen so that the RMS change is about the
 one drawn. Nothing here knows a model or a diagnosis. `benchmarks.elastica_cases` and
 `benchmarks.chain_cases` are two generators.
@@ -60,6 +61,8 @@ KNOWN = {
 """Hidden effect of every generator -> the name that a diagnosis should give."""
 FURTHER_KNOWN = {"backlash": "hysteresis", "inertia": "inertia"}
 """The same of effects that only some generators have (`Generator.further`)."""
+LATER_KNOWN = {"zero_offset": "zero_offset"}
+"""The same of effects that joined later, which `--later` adds in a plan of their own."""
 ALIKE = (
     {"line_lag", "rate_dependence"},
     {"drift", "thermal_drift"},
@@ -97,7 +100,7 @@ TRIED_S = 40.0
 """Duration of a try [s]."""
 
 
-TAKES = {"round": 1_000, "pair": 10_000, "unknown": 20_000}
+TAKES = {"round": 1_000, "pair": 10_000, "unknown": 20_000, "later": 30_000}
 """Number of the first trial of each plan: every case has noise of its own."""
 
 
@@ -175,7 +178,7 @@ class Case:
     @property
     def truth(self) -> list[str]:
         """The names that a diagnosis should give; `unknown` for effects that it does not have."""
-        return [(KNOWN | FURTHER_KNOWN).get(name, "unknown") for name in self.names]
+        return [(KNOWN | FURTHER_KNOWN | LATER_KNOWN).get(name, "unknown") for name in self.names]
 
 
 def cases(generator: Generator, robots: list[int], count: int, seed: int) -> list[Case]:
@@ -206,6 +209,11 @@ def unknowns(generator: Generator, robots: list[int], count: int, seed: int) -> 
     """So many cases of an unknown effect, every kind in turn."""
     every = [(name,) for name in generator.more_unknown]
     return _drawn("unknown", every, CHANGE_MM, robots, count, seed)
+
+
+def later(robots: list[int], count: int, seed: int) -> list[Case]:
+    """So many cases of one effect of LATER_KNOWN, every one in turn."""
+    return _drawn("later", [(name,) for name in LATER_KNOWN], CHANGE_MM, robots, count, seed)
 
 
 def _drawn(
@@ -422,6 +430,7 @@ def main(generator: Generator, about: str, robots: str) -> None:
     parser.add_argument("--count", type=int, default=100, help="cases of the rounds")
     parser.add_argument("--pairs", type=int, default=0, help="further cases of two effects")
     parser.add_argument("--unknown", type=int, default=0, help="further cases of unknown effects")
+    parser.add_argument("--later", type=int, default=0, help="further cases of a shifted zero")
     longer = "factor on the durations of the recordings"
     parser.add_argument("--longer", type=float, default=1.0, help=longer)
     parser.add_argument("--seed", type=int, default=1)
@@ -435,6 +444,7 @@ def main(generator: Generator, about: str, robots: str) -> None:
         *cases(generator, seeds, given.count, given.seed),
         *pairs(seeds, given.pairs, given.seed),
         *unknowns(generator, seeds, given.unknown, given.seed),
+        *later(seeds, given.later, given.seed),
     ]
     report = functools.partial(print, flush=True)
     try:

@@ -1,7 +1,7 @@
 """Cases for a diagnosis on rods of polynomial strains: recordings before and after a change.
 
     python -m benchmarks.strain_rod_cases FOLDER [--robots 900,901,...] [--count 87] [--seed 1]
-        [--pairs 0] [--unknown 0] [--processes 1]
+        [--pairs 0] [--unknown 0] [--later 0] [--processes 1]
 
 `benchmarks.rig_cases` describes the folder (such as runs/strain_rod, outside git) and the plans,
 and `benchmarks.strain_rod` the physics. Changes are drawn in mm for each 100 mm of the arm.

@@ -1,7 +1,7 @@
 """Cases for a diagnosis on arms that tendons bend: recordings before and after a change.
 
     python -m benchmarks.tendon_cases FOLDER [--robots 1000,1001,...] [--count 93] [--seed 1]
-        [--pairs 0] [--unknown 0] [--processes 1]
+        [--pairs 0] [--unknown 0] [--later 0] [--processes 1]
 
 `benchmarks.rig_cases` describes the folder (such as runs/tendon, outside git) and the plans, and
 `benchmarks.tendon_arm` the physics. The actuation is the pull of each tendon in mm. Changes are

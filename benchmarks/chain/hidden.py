@@ -8,6 +8,7 @@ square); signs and places vary with the robot's seed. The laws, and those of the
 | `payload` | weight at the tip of the chain: a weight coincides | beam, to first order |
 | `hysteresis` | rubber friction of each joint (Berg 1998) | play operators on chambers |
 | `gain_mismatch` | two chambers of other areas: proportional, so it coincides | gain |
+| `zero_offset` | two sensors whose zero has shifted, down to no pressure | constant |
 | `line_lag` | isentropic nozzle, discharge by Perry (1949) | tube, root of the difference |
 | `creep` | network that relaxes by a power of its stress (Bergstrom & Boyce 1998) | retarded |
 | `misalignment` | rotation and shift of the cameras: coincides | rotation, shift, scale |
@@ -34,7 +35,7 @@ import numpy as np
 
 from benchmarks.chain.plant import Plant, move, new_state, place_links
 from benchmarks.chain.robot import STREAM
-from benchmarks.generators import EVENT_WINDOW_S, Setup, breath, misalignment, sideways
+from benchmarks.generators import EVENT_WINDOW_S, Setup, breath, misalignment, shift_zeros, sideways
 from surgisoft.rig.hidden import Hidden, switch_on_from
 
 
@@ -59,6 +60,10 @@ def _gain_mismatch(setup: Setup, strength: float, rng: np.random.Generator) -> N
     for chamber, share in zip(two, (0.07, -rng.uniform(0.0, 0.05)), strict=True):
         areas[chamber] *= math.exp(strength * share * rng.choice([-1.0, 1.0]))
     setup.change(areas=areas)
+
+
+def _zero_offset(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    shift_zeros(setup, strength, len(setup.plant.areas), rng)
 
 
 def _line_lag(setup: Setup, strength: float, rng: np.random.Generator) -> None:
@@ -202,6 +207,7 @@ HIDDEN: dict[str, Hidden[Setup]] = {
     "payload": Hidden("body", "unweighed mass at the tip", _payload),
     "hysteresis": Hidden("material", "more rubber friction in the joints", _hysteresis),
     "gain_mismatch": Hidden("material", "two chambers of other areas", _gain_mismatch),
+    "zero_offset": Hidden("sensor", "two pressure sensors whose zero has shifted", _zero_offset),
     "line_lag": Hidden("line", "narrow lines behind the sensors", _line_lag),
     "creep": Hidden("material", "a network that relaxes", _creep),
     "misalignment": Hidden("sensor", "camera frame turned and shifted", _misalignment),

@@ -11,6 +11,7 @@ along the loads. The laws and what they differ in from the effects of the arm mo
 | `line_lag`, servo | servo that saturates in its speed, v tanh(k d / v) | the same effect |
 | `dead_zone` | slack as a softplus | smoothed by a root |
 | `gain_mismatch` | one chamber's gain: the only form there is | coincides |
+| `zero_offset` | one chamber's zero, down to its lowest load | constant |
 | `hysteresis` | Bouc-Wen, biaxial (Park, Wen & Ang 1986), of the section's bending | play operators on the chambers |
 | `creep` | power law of time as a fractional kernel (Scott Blair 1947) | sums of retarded elements |
 | `rate_dependence` | Zener solid with Eyring's (1936) sinh dashpot | Kelvin-Voigt, Ellis fluid |
@@ -199,6 +200,13 @@ def _gain(arm: Arm, drawn: Drawn, strength: float) -> np.ndarray:
     gains = np.ones(arm.loads.shape[1])
     gains[drawn["chamber"]] += drawn["sign"] * strength
     return arm.points(loads=arm.loads * gains)
+
+
+def _zero(arm: Arm, drawn: Drawn, strength: float) -> np.ndarray:
+    """A regulator or motor whose sensor reads a constant too much or too little."""
+    shift = np.zeros(arm.loads.shape[1])
+    shift[drawn["chamber"]] = drawn["sign"] * strength
+    return arm.points(loads=np.maximum(arm.loads + shift, arm.loads.min(0)))
 
 
 # Material --------------------------------------------------------------------------------------
@@ -476,6 +484,7 @@ LAWS: dict[str, Law] = {
     "line_lag": Law("line_lag", nothing_drawn, _lag, 5.0),
     "dead_zone": Law("dead_zone", nothing_drawn, _dead_zone, 0.6),
     "gain_mismatch": Law("gain_mismatch", _draw_chamber, _gain, 0.6),
+    "zero_offset": Law("zero_offset", _draw_chamber, _zero, 0.4),
     "hysteresis": Law("hysteresis", _draw_hysteresis, _hysteresis, 1.5),
     "creep": Law("creep", _draw_creep, _creep, 0.6),
     "rate_dependence": Law("rate_dependence", _draw_rate, _rate, 3.0),

@@ -9,6 +9,7 @@ models:
 | `payload` | mass at one side of the tip: a weight coincides | beam, to first order |
 | `hysteresis` | friction of Dahl (1976) in each spring | play operators on chambers |
 | `gain_mismatch` | two regulators out of calibration: a factor coincides | gain |
+| `zero_offset` | two sensors whose zero has shifted, down to no pressure | constant |
 | `line_lag` | long capillaries with volumes between them | one lag, laminar to turbulent |
 | `creep` | retarded elements that stress hurries (Schapery 1969) | retarded, log-normal spectrum |
 | `misalignment` | rotation and shift of the cameras: coincides | rotation, shift, scale |
@@ -38,7 +39,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from benchmarks.generators import EVENT_WINDOW_S, Setup, breath, misalignment, sideways
+from benchmarks.generators import EVENT_WINDOW_S, Setup, breath, misalignment, shift_zeros, sideways
 from benchmarks.lattice.body import ALONG, LEFT, RIB, RIGHT
 from benchmarks.lattice.gas import VOLUMES
 from benchmarks.lattice.motion import new_state, settle
@@ -104,6 +105,10 @@ def _gain_mismatch(setup: Setup, strength: float, rng: np.random.Generator) -> N
     for chamber, share in zip(two, (0.06, -rng.uniform(0.0, 0.04)), strict=True):
         gains[chamber] *= math.exp(strength * share * rng.choice([-1.0, 1.0]))
     setup.change(gains=gains)
+
+
+def _zero_offset(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    shift_zeros(setup, strength, len(setup.plant.gains), rng)
 
 
 def _line_lag(setup: Setup, strength: float, rng: np.random.Generator) -> None:
@@ -241,6 +246,7 @@ HIDDEN: dict[str, Hidden[Setup]] = {
     "payload": Hidden("body", "unweighed mass at one side of the tip", _payload),
     "hysteresis": Hidden("material", "more friction in the springs (Dahl)", _hysteresis),
     "gain_mismatch": Hidden("line", "two regulators out of calibration", _gain_mismatch),
+    "zero_offset": Hidden("sensor", "two pressure sensors whose zero has shifted", _zero_offset),
     "line_lag": Hidden("line", "long capillaries behind the sensors", _line_lag),
     "creep": Hidden("material", "springs that yield faster under stress", _creep),
     "misalignment": Hidden("sensor", "camera frame turned and shifted", _misalignment),

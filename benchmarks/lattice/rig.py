@@ -28,8 +28,11 @@ class LatticeRig(Bench):
         robot = make_robot(seed)
         sizes = len(robot.plant.chambers), len(robot.plant.keys)
         seeds = (seed, take, STREAM)
-        super().__init__(robot, robot.plant.high, robot.plant.gravity, sizes, seeds, noise)
-        self._plant = switch_on(Setup(robot.plant), hidden, seed).plant
+        setup = switch_on(Setup(robot.plant), hidden, seed)
+        super().__init__(
+            robot, robot.plant.high, robot.plant.gravity, sizes, seeds, noise, setup.zero
+        )
+        self._plant = setup.plant
         self._state = motion.new_state(self._plant)
         self._state.time[0] = -REST_S
 

@@ -10,6 +10,7 @@ models:
 | `hysteresis` | MuJoCo's dry friction in the joints: with its spring each is a play operator \
 of the joint's couple, which coincides in form | play operators on chambers |
 | `gain_mismatch` | two chambers of other areas: a factor coincides | gain |
+| `zero_offset` | two sensors whose zero has shifted, down to no pressure | constant |
 | `line_lag` | MuJoCo's muscle activation, filling unlike venting (Millard et al. 2013) | one lag, \
 laminar to turbulent |
 | `creep` | a damped joint in series with each joint: linear, so it coincides in form | retarded, \
@@ -41,7 +42,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from benchmarks.generators import EVENT_WINDOW_S, Setup, breath, misalignment, sideways
+from benchmarks.generators import EVENT_WINDOW_S, Setup, breath, misalignment, shift_zeros, sideways
 from benchmarks.mujoco_arm.motion import Arm
 from benchmarks.mujoco_arm.robot import LINKS, STREAM, Plant
 from surgisoft.rig.hidden import Hidden, switch_on_from
@@ -87,6 +88,10 @@ def _gain_mismatch(setup: Setup, strength: float, rng: np.random.Generator) -> N
     for chamber, share in zip(two, (0.06, -rng.uniform(0.0, 0.04)), strict=True):
         areas[chamber] *= math.exp(strength * share * rng.choice([-1.0, 1.0]))
     setup.change(areas=areas)
+
+
+def _zero_offset(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    shift_zeros(setup, strength, len(setup.plant.areas), rng)
 
 
 def _line_lag(setup: Setup, strength: float, rng: np.random.Generator) -> None:
@@ -198,6 +203,7 @@ HIDDEN: dict[str, Hidden[Setup]] = {
     "payload": Hidden("body", "unweighed mass at one side of the tip", _payload),
     "hysteresis": Hidden("material", "dry friction in the joints", _hysteresis),
     "gain_mismatch": Hidden("material", "two chambers of other areas", _gain_mismatch),
+    "zero_offset": Hidden("sensor", "two pressure sensors whose zero has shifted", _zero_offset),
     "line_lag": Hidden("line", "chambers that fill and vent slowly", _line_lag),
     "creep": Hidden("material", "damped joints in series", _creep),
     "misalignment": Hidden("sensor", "camera frame turned and shifted", _misalignment),

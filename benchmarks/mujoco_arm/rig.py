@@ -28,8 +28,11 @@ class MujocoRig(Bench):
         robot = make_robot(seed)
         sizes = len(robot.plant.areas), len(robot.plant.keys)
         seeds = (seed, take, STREAM)
-        super().__init__(robot, robot.plant.high, robot.plant.gravity, sizes, seeds, noise)
-        self._arm = Arm(switch_on(Setup(robot.plant), hidden, seed).plant, -REST_S)
+        setup = switch_on(Setup(robot.plant), hidden, seed)
+        super().__init__(
+            robot, robot.plant.high, robot.plant.gravity, sizes, seeds, noise, setup.zero
+        )
+        self._arm = Arm(setup.plant, -REST_S)
 
     def rest(self) -> float:
         """Vent the robot and let it rest for REST_S; the time after it since switching on [s]."""

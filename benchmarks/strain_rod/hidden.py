@@ -10,6 +10,7 @@ models:
 | `hysteresis` | friction of fibres that pressure presses together (Tondu & Lopez 2000; Wen \
 1976) | play operators on chambers |
 | `gain_mismatch` | two chambers of other areas: proportional, so it coincides | gain |
+| `zero_offset` | two sensors whose zero has shifted, down to no pressure | constant |
 | `line_lag` | turbulent flow in smooth hoses (Blasius 1913) with a volume between | one lag, \
 laminar to turbulent |
 | `creep` | flow by the hyperbolic sine of stress (Garofalo 1965) against a spring | retarded, \
@@ -51,7 +52,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from benchmarks.generators import EVENT_WINDOW_S, Setup, breath, misalignment, sideways
+from benchmarks.generators import EVENT_WINDOW_S, Setup, breath, misalignment, shift_zeros, sideways
 from benchmarks.strain_rod.motion import move, new_state, place_arm
 from benchmarks.strain_rod.robot import PARTS, STREAM, Plant
 from surgisoft.rig.hidden import Hidden, switch_on_from
@@ -106,6 +107,10 @@ def _gain_mismatch(setup: Setup, strength: float, rng: np.random.Generator) -> N
     for chamber, share in zip(two, (0.07, -rng.uniform(0.0, 0.05)), strict=True):
         areas[chamber] *= math.exp(strength * share * rng.choice([-1.0, 1.0]))
     setup.change(areas=areas)
+
+
+def _zero_offset(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    shift_zeros(setup, strength, len(setup.plant.areas), rng)
 
 
 def _line_lag(setup: Setup, strength: float, rng: np.random.Generator) -> None:
@@ -232,6 +237,7 @@ HIDDEN: dict[str, Hidden[Setup]] = {
     "payload": Hidden("body", "unweighed mass beside the tip", _payload),
     "hysteresis": Hidden("material", "fibres that pressure presses together", _hysteresis),
     "gain_mismatch": Hidden("material", "two chambers of other areas", _gain_mismatch),
+    "zero_offset": Hidden("sensor", "two pressure sensors whose zero has shifted", _zero_offset),
     "line_lag": Hidden("line", "narrow hoses behind the sensors", _line_lag),
     "creep": Hidden("material", "a wall that flows by the sinh of stress", _creep),
     "misalignment": Hidden("sensor", "camera frame turned and shifted", _misalignment),

@@ -13,6 +13,8 @@ hole deflects a tendon (Euler 1775), none in a slack one | play operators of one
 | `backlash` | play between the encoder and the drum of two motors: one play operator, which \
 coincides; truth `hysteresis` | play operators |
 | `gain_mismatch` | two drums of other radii: a factor coincides | gain |
+| `zero_offset` | drums of two motors that were homed elsewhere, down to the lower limit | \
+constant |
 | `line_lag` | a drum that follows its encoder late, and no faster than a highest speed | one lag, \
 laminar to turbulent |
 | `creep` | tendons that elongate by a power of their tension, which depends on the posture, too | \
@@ -49,7 +51,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from benchmarks.generators import EVENT_WINDOW_S, Setup, misalignment, sideways
+from benchmarks.generators import EVENT_WINDOW_S, Setup, misalignment, shift_zeros, sideways
 from benchmarks.tendon_arm.motion import Arm
 from benchmarks.tendon_arm.robot import RETARDED, STREAM, Plant
 from surgisoft.rig.hidden import Hidden, switch_on_from
@@ -96,6 +98,10 @@ def _gain_mismatch(setup: Setup, strength: float, rng: np.random.Generator) -> N
     for tendon, share in zip(two, (0.06, -rng.uniform(0.0, 0.04)), strict=True):
         gains[tendon] *= math.exp(strength * share * rng.choice([-1.0, 1.0]))
     setup.change(gains=gains)
+
+
+def _zero_offset(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    shift_zeros(setup, strength, len(setup.plant.offset), rng)
 
 
 def _line_lag(setup: Setup, strength: float, rng: np.random.Generator) -> None:
@@ -234,6 +240,7 @@ HIDDEN: dict[str, Hidden[Setup]] = {
     "hysteresis": Hidden("material", "bare holes: friction by tension", _hysteresis),
     "backlash": Hidden("line", "play between encoder and drum of two motors", _backlash),
     "gain_mismatch": Hidden("line", "two drums of other radii", _gain_mismatch),
+    "zero_offset": Hidden("sensor", "two motors that were homed elsewhere", _zero_offset),
     "line_lag": Hidden("line", "drums that follow late and no faster than they can", _line_lag),
     "creep": Hidden("material", "tendons that elongate under tension", _creep),
     "misalignment": Hidden("sensor", "camera frame turned and shifted", _misalignment),

@@ -32,9 +32,10 @@ class TendonRig(Bench):
         robot = make_robot(seed)
         plant = robot.plant
         sizes, seeds = (len(plant.offset), len(plant.keys)), (seed, take, STREAM)
-        super().__init__(robot, plant.high, plant.gravity, sizes, seeds, noise)
+        setup = switch_on(Setup(plant), hidden, seed)
+        super().__init__(robot, plant.high, plant.gravity, sizes, seeds, noise, setup.zero)
         self._encoders = build_of(seed).encoders
-        self._arm = Arm(switch_on(Setup(plant), hidden, seed).plant, -REST_S)
+        self._arm = Arm(setup.plant, -REST_S)
 
     def rest(self) -> float:
         """Home the motors and let the robot rest for REST_S; the time after it since switching

@@ -35,6 +35,8 @@ class Effects(NamedTuple):
     """(m,) pressure lost over the tube at 54 kPa [kPa]."""
     dead_zone: float
     """Pressure below which a chamber does not push [kPa]."""
+    zero: np.ndarray
+    """(m,) shift of each pressure sensor's zero [kPa]."""
     gain: np.ndarray
     """(m,) relative change of a chamber's push at low pressure [-]."""
     coupling: np.ndarray
@@ -98,6 +100,7 @@ def no_effects(chambers: int, line_stiffness: float) -> Effects:
         crosstalk=0.0,
         leak=np.zeros(chambers),
         dead_zone=0.0,
+        zero=np.zeros(chambers),
         gain=np.zeros(chambers),
         coupling=np.zeros((chambers, chambers)),
         creep=0.0,
@@ -160,7 +163,8 @@ def effective_pressures(
     """Pressures (m,) [kPa] that push on the wall, from those in the chambers (m,) [kPa].
 
     time, step: [s]. Leak: a crack that opens above 5 kPa, so that the flow along the tube takes
-    pressure away. Gain: wears off towards high pressure. Coupling: a neighbour's wall bulges with
+    pressure away. Zero: a sensor that was overloaded, whose span is another, too. Gain: wears off
+    towards high pressure. Coupling: a neighbour's wall bulges with
     its pressure squared. Broken fibre: from one moment on the chamber bulges outwards with its
     pressure squared (without fibres that is where the pressure goes: Polygerinos et al. 2015). Dead
     zone: folds that open smoothly. Creep: a ladder of retarded loads, nonlinear in the load.
@@ -171,6 +175,8 @@ def effective_pressures(
         push = p
         if effects.leak[i] != 0.0 and p > 5.0:
             push -= effects.leak[i] * ((p - 5.0) / (REFERENCE_KPA - 5.0)) ** 1.5
+        if effects.zero[i] != 0.0:
+            push += effects.zero[i] * (1.0 - 0.3 * p / REFERENCE_KPA)
         if effects.gain[i] != 0.0:
             push += effects.gain[i] * p * (1.0 - 0.4 * p / REFERENCE_KPA)
         for j in range(m):

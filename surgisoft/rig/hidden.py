@@ -129,6 +129,10 @@ def _gain_mismatch(setup: Setup, strength: float, rng: np.random.Generator) -> N
     _set(setup, gain=0.05 * strength * _pattern(rng, len(setup.effects.gain)))
 
 
+def _zero_offset(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    _set(setup, zero=1.2 * strength * _pattern(rng, len(setup.effects.zero)))
+
+
 def _coupling(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     m = len(setup.effects.gain)
     matrix = 3.0 * strength * rng.uniform(0.6, 1.4, (m, m))
@@ -265,6 +269,9 @@ HIDDEN: dict[str, Hidden[Setup]] = {
     "dead_zone": Hidden("material", "folds that open smoothly before a chamber pushes", _dead_zone),
     "gain_mismatch": Hidden(
         "material", "chambers push unequally, less so at high pressure", _gain_mismatch
+    ),
+    "zero_offset": Hidden(
+        "sensor", "pressure sensors whose zero has shifted, and their span a little", _zero_offset
     ),
     "coupling": Hidden("material", "a bulging chamber takes push from the others", _coupling),
     "payload": Hidden("body", "unweighed mass at the tip, off its centre", _payload),

@@ -30,8 +30,10 @@ from benchmarks.chain_cases import GENERATOR, UNKNOWN
 from benchmarks.decision import folders
 from benchmarks.rig_cases import (
     KNOWN,
+    LATER_KNOWN,
     Case,
     cases,
+    later,
     load_case,
     make_case,
 )
@@ -39,6 +41,7 @@ from benchmarks.rig_cases import (
     make_robot as record_robot,
 )
 from surgisoft.errors import InputError
+from surgisoft.measurement.protocols import Protocol as Schedule
 
 PLAIN = Wall(0.05, np.zeros(2), np.zeros(2), 0.0, 0.0, np.array([0.0, 0.5]))
 """A linear wall."""
@@ -185,9 +188,9 @@ def test_noise_and_dropped_frames_are_those_of_the_cameras():
 
 
 def test_the_generator_has_every_known_effect_and_no_name_for_the_others():
-    assert set(HIDDEN) == {*KNOWN, *UNKNOWN}
+    assert set(HIDDEN) == {*KNOWN, *LATER_KNOWN, *UNKNOWN}
     planned = cases(GENERATOR, [600, 601], 29, seed=1)
-    assert {case.names[0] for case in planned if len(case.names) == 1} == set(HIDDEN)
+    assert {case.names[0] for case in planned if len(case.names) == 1} == {*HIDDEN} - {*LATER_KNOWN}
     assert {make_robot(seed).plant.areas.shape[0] for seed in range(600, 606)} == {3, 4, 6}
 
 
@@ -202,6 +205,37 @@ def test_every_effect_changes_the_motion_and_nothing_else_does():
         moved = ChainRig(600, noise=0.0, hidden=[(name, 2.0)]).record(protocol)[1]
         share = rig_cases.change_mm(moved.noise_free_mm, plain) / rig.arm.length_mm
         assert 5e-4 < share < 0.3, name
+
+
+def test_an_arm_whose_sensors_have_shifted_zeros_does_what_it_would_at_other_pressures():
+    """Readings follow the commands. Where the zero reads too much, the chamber has less air."""
+    rig = ChainRig(600, noise=0.0)
+    commands = 0.5 * rig.limits[:, 1] + np.array([[0.0, 5.0, -5.0], [5.0, -5.0, 0.0]])
+    held = Schedule("held", "continuous", commands, [0, 0], [0.0, 8.0], unit="kPa")
+    seen, moved = ChainRig(600, noise=0.0, hidden=[("zero_offset", 1.5)]).record(held)
+    plain = rig.record(held)[0]
+    np.testing.assert_allclose(seen.measured[-1], plain.measured[-1], atol=0.02)
+    shift = moved.pressures_kPa[-1] - seen.measured[-1]
+    least, second, most = np.sort(np.abs(shift) / rig.limits[0, 1])
+    assert (least, most) == pytest.approx((0.0, 0.06), abs=1e-3)
+    assert 0.017 < second < 0.061
+    other = Schedule("other", "continuous", commands + shift, [0, 0], [0.0, 8.0], unit="kPa")
+    there = ChainRig(600, noise=0.0).record(other)[1]
+    np.testing.assert_allclose(moved.noise_free_mm[-1], there.noise_free_mm[-1], atol=0.01)
+    lowest = rig.limits[:, 0] + 0 * commands
+    vented = Schedule("vented", "continuous", lowest, [0, 0], [0.0, 8.0], unit="kPa")
+    seen, moved = ChainRig(600, noise=0.0, hidden=[("zero_offset", 1.5)]).record(vented)
+    more, less = np.maximum(shift, 0.0), np.maximum(-shift, 0.0)
+    np.testing.assert_allclose(moved.pressures_kPa[-1], rig.limits[:, 0] + more, atol=0.02)
+    np.testing.assert_allclose(seen.measured[-1], rig.limits[:, 0] + less, atol=0.02)
+
+
+def test_effects_that_joined_later_have_a_plan_of_their_own():
+    found = later([600, 601], 5, seed=3)
+    assert [case.names for case in found] == [("zero_offset",)] * 5
+    assert {case.robot for case in found} == {600, 601}
+    assert found[0].truth == ["zero_offset"]
+    assert found[4].name == "later-004"
 
 
 def test_a_case_changes_as_much_as_is_drawn(tmp_path):

@@ -31,7 +31,7 @@ from benchmarks.lattice.wall import (
     taut,
 )
 from benchmarks.lattice_cases import GENERATOR, UNKNOWN
-from benchmarks.rig_cases import KNOWN, cases
+from benchmarks.rig_cases import KNOWN, LATER_KNOWN, cases
 
 LENGTH, RADIUS, ALONG_N = 0.2, 0.01, 50.0
 """Length and radius of an even arm [m], and rigidity of its springs along the arm [N]."""
@@ -278,9 +278,9 @@ def test_the_motion_does_not_depend_on_the_time_step():
 
 
 def test_the_generator_has_every_known_effect_and_no_name_for_the_others():
-    assert set(HIDDEN) == {*KNOWN, *UNKNOWN}
+    assert set(HIDDEN) == {*KNOWN, *LATER_KNOWN, *UNKNOWN}
     planned = cases(GENERATOR, [700, 701], 29, seed=1)
-    assert {case.names[0] for case in planned if len(case.names) == 1} == set(HIDDEN)
+    assert {case.names[0] for case in planned if len(case.names) == 1} == {*HIDDEN} - {*LATER_KNOWN}
     assert {build.chambers for build in BUILDS} == {3, 4, 6}
 
 

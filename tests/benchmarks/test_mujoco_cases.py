@@ -16,7 +16,7 @@ from benchmarks.mujoco_arm.motion import STEP_S, Arm, regulated
 from benchmarks.mujoco_arm.rig import MujocoRig
 from benchmarks.mujoco_arm.robot import BUILDS, LINKS, make_robot
 from benchmarks.mujoco_cases import GENERATOR, UNKNOWN
-from benchmarks.rig_cases import KNOWN, cases
+from benchmarks.rig_cases import KNOWN, LATER_KNOWN, cases
 
 ROBOT = 801
 """A level arm with four chambers."""
@@ -158,9 +158,9 @@ def test_pressures_alike_bulge_no_wall():
 
 
 def test_the_generator_has_every_known_effect_and_no_name_for_the_others():
-    assert set(HIDDEN) == {*KNOWN, *UNKNOWN}
+    assert set(HIDDEN) == {*KNOWN, *LATER_KNOWN, *UNKNOWN}
     planned = cases(GENERATOR, [800, 801], 29, seed=1)
-    assert {case.names[0] for case in planned if len(case.names) == 1} == set(HIDDEN)
+    assert {case.names[0] for case in planned if len(case.names) == 1} == {*HIDDEN} - {*LATER_KNOWN}
     assert {build.chambers for build in BUILDS} == {3, 4, 6}
 
 

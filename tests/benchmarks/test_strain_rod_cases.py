@@ -9,7 +9,7 @@ from scipy.linalg import expm
 
 from benchmarks import rig_cases
 from benchmarks.generators import ROOM_C, Setup
-from benchmarks.rig_cases import KNOWN, cases
+from benchmarks.rig_cases import KNOWN, LATER_KNOWN, cases
 from benchmarks.strain_rod import motion
 from benchmarks.strain_rod.gas import AMBIENT_PA, LAMINAR, SCALE, conductance, fill
 from benchmarks.strain_rod.hidden import HIDDEN, switch_on
@@ -516,9 +516,9 @@ def test_half_the_step_changes_the_motion_by_less_than_the_noise(monkeypatch):
 
 
 def test_the_generator_has_every_known_effect_and_no_name_for_the_others():
-    assert set(HIDDEN) == {*KNOWN, *UNKNOWN}
+    assert set(HIDDEN) == {*KNOWN, *LATER_KNOWN, *UNKNOWN}
     planned = cases(GENERATOR, [900, 901], 29, seed=1)
-    assert {case.names[0] for case in planned if len(case.names) == 1} == set(HIDDEN)
+    assert {case.names[0] for case in planned if len(case.names) == 1} == {*HIDDEN} - {*LATER_KNOWN}
     assert {build.chambers for build in BUILDS} == {3, 4, 6}
 
 
@@ -531,7 +531,7 @@ def test_every_effect_changes_the_motion_and_nothing_else_does():
     plain, chambers = truth.noise_free_mm, truth.pressures_kPa
     again = StrainRodRig(901, noise=0.0).record(protocol)[1].noise_free_mm
     np.testing.assert_array_equal(again, plain)
-    for name in HIDDEN:
+    for name in {*HIDDEN} - {*LATER_KNOWN}:
         seen, moved = StrainRodRig(901, noise=0.0, hidden=[(name, 2.0)]).record(protocol)
         share = rig_cases.change_mm(moved.noise_free_mm, plain) / rig.arm.length_mm
         assert 5e-4 < share < 0.3, name

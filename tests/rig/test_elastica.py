@@ -19,6 +19,7 @@ from surgisoft.rig import elastica as package
 from surgisoft.rig.collect import collect
 from surgisoft.rig.elastica import HIDDEN, ElasticaRig
 from surgisoft.rig.elastica.gas import AMBIENT_PA, Air, Gas, fill_chambers, flow
+from surgisoft.rig.elastica.hidden import Setup, switch_on
 from surgisoft.rig.elastica.plant import advance, new_state
 from surgisoft.rig.elastica.robot import make_robot
 from surgisoft.rig.elastica.rod import (
@@ -181,6 +182,17 @@ def test_a_pressure_bends_the_arm_to_a_circle_away_from_its_chamber():
     assert np.ptp(state.body.kappa[0]) < 1e-3 * curvature
     assert state.body.position[1, -1] < -0.001
     assert abs(state.body.position[0, -1]) < 1e-6
+
+
+def test_a_permanent_set_bends_the_arm_without_pressure():
+    """Its curvature at rest is a twentieth of that by one full chamber, more near the base."""
+    plant, state = one_arm()
+    setup = switch_on(Setup(plant, state.body), [("zero_offset", 1.0)], 3)
+    advance(setup.plant, state, round(1.5 / plant.step), False)
+    bent = np.linalg.norm(state.body.kappa[:2], axis=0) / plant.curvature
+    assert bent.mean() == pytest.approx(0.05, rel=0.01)
+    assert bent[[0, -1]] == pytest.approx([0.065, 0.035], rel=0.02)
+    np.testing.assert_allclose(state.body.kappa[2], 0.0, atol=1e-9)
 
 
 def test_fibres_at_an_angle_twist_without_bending():

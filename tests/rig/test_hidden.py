@@ -11,7 +11,7 @@ from surgisoft.rig.effects import (
     new_history,
     no_effects,
 )
-from surgisoft.rig.hidden import HIDDEN
+from surgisoft.rig.hidden import HIDDEN, Setup, switch_on
 
 
 def truth_of(protocol, seed=1, **options):
@@ -181,6 +181,17 @@ def test_sensor_channels_mix():
     recording, truth = VirtualRig(1, hidden=[("sensor_crosstalk", 1.0)]).record(protocol)
     np.testing.assert_allclose(recording.measured[0], [50, 0, 0], atol=0.3)
     assert truth.pressures_kPa[0, 1] < -1.0
+
+
+def test_a_shifted_zero_pushes_like_other_pressures():
+    """At half of 54 kPa an arm whose zeros have shifted is where 0.85 of the shift takes it."""
+    setup = Setup(no_effects(3, 1.0), None, None)
+    zero = switch_on(setup, [("zero_offset", 1.0)], 1).effects.zero
+    assert np.sqrt(np.mean(zero**2)) == pytest.approx(1.2)
+    plain, shifted = tips([np.full(3, 27.0)], "zero_offset", 1.0)
+    there, _ = tips([27.0 + 0.85 * zero], "zero_offset", 0.0)
+    assert np.linalg.norm(there - plain) > 1.0
+    np.testing.assert_allclose(shifted, there, atol=0.1)
 
 
 def test_two_effects_at_once():

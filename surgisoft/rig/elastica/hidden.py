@@ -103,6 +103,13 @@ def _gain_mismatch(setup: Setup, strength: float, rng: np.random.Generator) -> N
     _set(setup, areas=areas, levers=levers)
 
 
+def _zero_offset(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    """A permanent set: the wall stays bent, the more the nearer to the base."""
+    count, curvature = setup.plant.bow.shape[1], 0.05 * strength * setup.plant.curvature
+    share = np.linspace(1.3, 0.7, count)
+    _set(setup, bow=setup.plant.bow + curvature * _sideways(rng)[:2, None] * share)
+
+
 def _coupling(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     """Thin walls between neighbours in the ring of chambers."""
     m = len(setup.plant.areas)
@@ -224,6 +231,7 @@ HIDDEN: dict[str, Hidden[Setup]] = {
     "stiffening": Hidden("material", "chains of limited length (Gent)", _stiffening),
     "dead_zone": Hidden("material", "folded membranes that have to unfold", _dead_zone),
     "gain_mismatch": Hidden("material", "one chamber of another area", _gain_mismatch),
+    "zero_offset": Hidden("material", "a wall with a permanent set", _zero_offset),
     "coupling": Hidden("material", "chambers bulge into their neighbours", _coupling),
     "inertia": Hidden("material", "less damping: the arm swings", _inertia),
     "payload": Hidden("body", "unweighed mass at the tip", _payload),

@@ -34,10 +34,12 @@ from surgisoft.surrogate.effects.readings import Reading, in_words
 from surgisoft.surrogate.effects.softening import Softening
 from surgisoft.surrogate.effects.stiffening import Stiffening
 from surgisoft.surrogate.effects.twist import Twist
+from surgisoft.surrogate.effects.zero_offset import ZeroOffset
 
 EFFECTS: dict[str, type[Effect]] = {
     "line_lag": LineLag,
     "gain_mismatch": GainMismatch,
+    "zero_offset": ZeroOffset,
     "coupling": Coupling,
     "dead_zone": DeadZone,
     "stiffening": Stiffening,

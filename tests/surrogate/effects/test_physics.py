@@ -263,6 +263,16 @@ def test_gains_and_coupling_by_hand():
     )
 
 
+def test_a_shifted_zero_adds_the_same_at_rest_and_under_load():
+    """An arm from 10 to 50 kPa that rests at 20: a tenth of the 30 kPa up to the end is 3 kPa."""
+    resting = replace(RANGE, low=torch.full((3,), 10.0), high=torch.full((3,), 50.0))
+    resting = replace(resting, rest=torch.full((3,), 20.0))
+    shifted = with_strength(make_effect("zero_offset", resting), offset=[0.1, 0.0, -0.2])
+    for kPa in (10.0, 20.0, 47.0):
+        answer = shifted.apply(torch.full((1, 3), kPa), torch.zeros(1, 0))
+        assert answer[0].tolist() == pytest.approx([kPa + 3.0, kPa, kPa - 6.0])
+
+
 @pytest.mark.parametrize(
     ("name", "options", "memory"),
     [

@@ -53,6 +53,14 @@ def test_a_gain_is_the_push_that_a_chamber_has_more():
     assert in_words(effect.readings()) == "push of chamber 1 +10 %, push of chamber 2 -8 %"
 
 
+def test_a_shifted_zero_is_told_in_the_unit_of_the_actuation():
+    effect = with_amplitudes(make_effect("zero_offset", FACTS), offset=[0.05, 0.0, -0.02])
+    more = effect.apply(loaded(0, 0, 0), NONE) - loaded(0, 0, 0)
+    assert list(values(effect).values()) == pytest.approx(more[0].tolist(), abs=1e-6)
+    said = [f"zero of chamber {i} shifted by {more[0, i - 1]:+.2g} kPa" for i in (1, 3)]
+    assert in_words(effect.readings()) == ", ".join(said)
+
+
 @pytest.mark.parametrize("config", [{"pairs": True}, {"who": "next"}, {"who": "previous"}, {}])
 def test_a_coupling_says_which_chamber_loses_to_which(config):
     """By the effect itself, with one chamber fully loaded, and with two."""

@@ -233,6 +233,19 @@ def moved_together(actuation: np.ndarray) -> str:
     return ", ".join(parts)
 
 
+def tied_channels(actuation: np.ndarray) -> int:
+    """Number of moving channels of an actuation (T, m) that move as another one does (`TOGETHER`).
+
+    Of three that move as one, two count: so many directions the actuation does not explore.
+    """
+    spread = np.ptp(actuation, axis=0)
+    live = np.flatnonzero(spread > IDLE_SHARE * spread.max(initial=0.0))
+    if len(live) < 2:
+        return 0
+    alike = np.abs(np.corrcoef(actuation[:, live].T)) >= TOGETHER
+    return int(sum(alike[i, :i].any() for i in range(len(live))))
+
+
 def _mean_temperature(recordings: list[Recording]) -> float | None:
     """Mean temperature of the room, degrees Celsius; None where no recording knows it."""
     known = [r.temp_C for r in recordings if r.temp_C is not None]

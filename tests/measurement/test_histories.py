@@ -13,6 +13,7 @@ from surgisoft.measurement.histories import (
     history_of,
     moved_together,
     speed_of,
+    tied_channels,
 )
 from surgisoft.measurement.recordings import Recording
 
@@ -138,3 +139,5 @@ def test_channels_that_move_as_one_are_named():
     assert moved_together(summed) == "each of channels 1, 2 and 3 follows from the others"
     assert moved_together(np.column_stack([free[:, 0], np.ones(2000)])) == ""
     assert moved_together(np.zeros((9, 3))) == moved_together(free[:, :1]) == ""
+    counts = [tied_channels(some) for some in (free, pairs, all_four, apart, free[:, :1])]
+    assert counts == [0, 2, 3, 0, 0]

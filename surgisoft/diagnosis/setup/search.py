@@ -280,10 +280,13 @@ class Search:
         mistakes: dict[tuple[str, str], float],
         settings: SearchSettings = SETTINGS,
         proof: Proof = PROOF,
+        orders: bool = True,
     ):
-        """mistakes: those with the unit of actuation that are tried (`unit_mistakes`)."""
+        """mistakes: those with the unit of actuation that are tried (`unit_mistakes`); orders:
+        whether the recordings can show which channel drives which chamber."""
         self.coarse, self.fine, self.full, self.levels = coarse, fine, full, levels
         self.mistakes, self.settings, self.proof = mistakes, settings, proof
+        self.orders = orders
         self.factors = (1.0, *mistakes.values())
         self.border = Border.of(coarse.model)
         self.chambers = coarse.history.chambers
@@ -298,7 +301,8 @@ class Search:
         coarse, fine, full = (
             each.with_time(factor) for each in (self.coarse, self.fine, self.full)
         )
-        other = Search(coarse, fine, full, self.levels, self.mistakes, self.settings, self.proof)
+        kept = self.levels, self.mistakes, self.settings, self.proof, self.orders
+        other = Search(coarse, fine, full, *kept)
         other.time_factor = self.time_factor * factor
         return other
 
@@ -348,6 +352,8 @@ class Search:
             tried = [each for each in tried if "time" not in each.hypothesis.kinds]
             best = self._simplest(tried)
         if not best.hypothesis.kinds:
+            return None
+        if "chambers" in best.hypothesis.kinds and not self.orders:
             return None
         if not self._proved(start, best):
             return None

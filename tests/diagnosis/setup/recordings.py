@@ -22,10 +22,19 @@ def predicted(rows: int = 2400, seed: int = 0, rests: int = 0) -> Recording:
 
     rests: number of last rows in which the first chamber rests at no pressure.
     """
+
+    def resting(actuation):
+        actuation[rows - rests :, 0] = 0.0
+        return actuation
+
+    return predicted_along(resting, rows, seed)
+
+
+def predicted_along(change, rows: int = 2400, seed: int = 0) -> Recording:
+    """The same along another actuation (rows, 3), which `change` makes of the ramps and rests."""
     model = default_arm()
     low, high = np.array(model.spec.low), np.array(model.spec.high)
-    actuation = low + walk(rows, 3, seed) / 10.0 * (high - low)
-    actuation[rows - rests :, 0] = 0.0
+    actuation = change(low + walk(rows, 3, seed) / 10.0 * (high - low))
     empty = Recording(
         name="bench",
         t_s=STEP_S * np.arange(rows),

@@ -18,6 +18,7 @@ from tests.diagnosis.setup.recordings import (
     late,
     measured,
     predicted,
+    predicted_along,
     turned,
     with_points,
 )
@@ -124,6 +125,22 @@ def test_one_fault_is_named_and_mended(model, name):
         apart = corrected.key_points_mm - original.key_points_mm
         assert np.sqrt(np.square(apart).sum(2).mean()) < 0.05
         np.testing.assert_allclose(corrected.measured, original.measured, atol=1e-9)
+
+
+def test_channels_that_the_fit_did_not_tie_cannot_show_an_exchange(model):
+    """Channels 2 and 3 move as one: where the model errs there, an exchange of them with channel 1
+    is no proof. A model without its rows, or fitted to such motion, has no reason to doubt it."""
+    tied = predicted_along(lambda free: free[:, [0, 1, 1]])
+    wrong = driven(tied, lambda free: free[:, [2, 1, 0]])
+    known = model.training_residuals
+    alike = replace(known, actuation=known.actuation[:, [0, 1, 1]], past=None)
+    for rows in (None, alike):
+        other = model.replace()
+        other.training_residuals = rows
+        found = find_setup_faults(other, [wrong])
+        assert found is not None
+        assert found.kinds == ("chambers",)
+    assert find_setup_faults(model, [wrong]) is None
 
 
 def test_without_noise_a_rotation_is_exact(model):

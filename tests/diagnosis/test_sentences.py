@@ -341,6 +341,19 @@ def test_a_static_function_is_named_only_where_it_explains_most():
     assert text not in sentence_of(given, LEVELS, [])
 
 
+@pytest.mark.parametrize(
+    ("second", "head"),
+    [
+        (0.03, "creep is probably missing (0.72; drift, which comes next, 0.03) (confidence 0.75 "),
+        (0.06, "cannot tell creep from drift with these recordings (confidence 0.75 that it is on"),
+    ],
+)
+def test_of_a_set_whose_second_effect_is_far_behind_the_first_is_named(second, head):
+    chances = replace(CHANCES, effects={"creep": 0.72, "drift": second})
+    given = decision("ambiguous", "creep", "drift", chances=chances)
+    assert sentence_of(given, LEVELS, [0.15, 0.16]).startswith(head)
+
+
 def test_effects_of_a_set_that_leave_different_errors_have_one_each():
     given = decision("ambiguous", "creep", "drift")
     assert "each would leave about 0.15 mm on" in sentence_of(given, LEVELS, [0.15, 0.16])

@@ -165,6 +165,9 @@ the validated one (`ErrorLevels.size`)."""
 FAR_BEHIND = 0.05
 """Probability of the second effect of a set below which the sentence names the first: of 21 such
 sets on judged robots the first was missing in 17, the second in one."""
+MOSTLY_SMOOTH = 0.5
+"""Share of the error below which the discrepancy of the model alone, without an effect, leaves so
+little that the sentence has to say so: a half."""
 CANNOT_TELL = "cannot tell what is missing, if anything"
 """Begin of the sentence of `cannot_tell`."""
 WITHOUT_SLIP = "surgisoft diagnose {model} REC_BEFORE_THE_SLIP{before}"
@@ -876,6 +879,7 @@ def result_of(
             *(local_error(along, recordings) if kind not in NAMING else ()),
             *would_explain(found, decision),
             *second_too(decision),
+            *smooth_error(levels, decision),
             *amplitudes_that_vary(evidence, decision),
         ),
         statistics=evidence,
@@ -938,6 +942,22 @@ def second_too(decision: Decision) -> list[str]:
     return [
         f"{others[0]} may be missing beside {named[0]} (probability {chances.pair:.2f} that both "
         f"are): 'surgisoft improve' adds one after the other, as long as each lowers the error"
+    ]
+
+
+def smooth_error(levels: ErrorLevels, decision: Decision) -> list[str]:
+    """That much of the error is one of the model itself, beside a named effect, in words.
+
+    Every error on held-out blocks allows for a discrepancy of the model, a smooth function of the
+    actuation. A model with the effect and without that function errs more.
+    """
+    alone = levels.discrepancy_alone
+    if decision.kind not in NAMING or alone is None or alone > MOSTLY_SMOOTH * levels.before:
+        return []
+    return [
+        f"of the error of {levels.before:.3g} mm only {alone:.3g} mm remain without any effect "
+        "where the model may be off by a smooth function of the actuation, and errors on held-out "
+        "blocks allow for that; 'surgisoft amend' says what the named effect leaves without it"
     ]
 
 

@@ -31,6 +31,7 @@ from surgisoft.diagnosis.diagnose import (
     next_command,
     periodic,
     sentence_of,
+    smooth_error,
     with_refit,
 )
 from surgisoft.diagnosis.estimation.intervals import Parameter
@@ -352,6 +353,17 @@ def test_of_a_set_whose_second_effect_is_far_behind_the_first_is_named(second, h
     chances = replace(CHANCES, effects={"creep": 0.72, "drift": second})
     given = decision("ambiguous", "creep", "drift", chances=chances)
     assert sentence_of(given, LEVELS, [0.15, 0.16]).startswith(head)
+
+
+def test_an_error_that_is_mostly_the_models_own_is_told_beside_a_name():
+    """Of 9.7 mm a smooth function of the actuation takes all but 2.8 mm, and none of a 1 mm."""
+    own = replace(LEVELS, before=9.7, discrepancy_alone=2.8)
+    (text,) = smooth_error(own, decision("identified", "creep"))
+    assert text.startswith("of the error of 9.7 mm only 2.8 mm remain without any effect where the")
+    assert smooth_error(own, decision("cannot_tell")) == []
+    for alone in (0.74, None):
+        levels = replace(LEVELS, before=1.02, discrepancy_alone=alone)
+        assert smooth_error(levels, decision("several", "creep", "drift")) == []
 
 
 def test_effects_of_a_set_that_leave_different_errors_have_one_each():

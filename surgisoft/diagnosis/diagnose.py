@@ -1242,8 +1242,8 @@ def sentence_of(
         chances = [decision.probabilities.effects.get(name, 1.0) for name in effects]
         if chances[1] < FAR_BEHIND:
             head = (
-                f"{effects[0]} is probably missing ({chances[0]:.2f}; {effects[1]}, which comes "
-                f"next, {chances[1]:.2f})"
+                f"{effects[0]} is probably missing, with {chances[0]:.2f}, and {effects[1]} comes "
+                f"next, with {chances[1]:.2f}"
             )
         return f"{head} (confidence {sure:.2f} that it is one of them): {left}; {error}"
     if kind == "unknown_effect":

@@ -345,7 +345,7 @@ def test_a_static_function_is_named_only_where_it_explains_most():
 @pytest.mark.parametrize(
     ("second", "head"),
     [
-        (0.03, "creep is probably missing (0.72; drift, which comes next, 0.03) (confidence 0.75 "),
+        (0.03, "creep is probably missing, with 0.72, and drift comes next, with 0.03 (confidence"),
         (0.06, "cannot tell creep from drift with these recordings (confidence 0.75 that it is on"),
     ],
 )

@@ -201,25 +201,26 @@ class Moves:
         every, begins = self._joined
         parts = zip(rows, begins, strict=True)
         at = np.concatenate([at + begin for at, begin in parts])[order] - shift
-        features = _features(every.take(at, axis=0))
-        features -= _features(every.take(at - length, axis=0))
+        features = _features(every.take(at, axis=1))
+        features -= _features(every.take(at - length, axis=1))
         moved = moved[order]
-        grams = np.stack([features[fold].T @ features[fold] for fold in folds])
-        pulls = np.stack([features[fold].T @ moved[fold] for fold in folds])
+        grams = np.stack([features[:, fold] @ features[:, fold].T for fold in folds])
+        pulls = np.stack([features[:, fold] @ moved[fold] for fold in folds])
         others, pulled = grams.sum(axis=0) - grams, pulls.sum(axis=0) - pulls
-        count = features.shape[1]
+        count = len(features)
         ridge = np.maximum(RIDGE * np.trace(others, axis1=1, axis2=2) / count, 1e-12)
         weights = np.linalg.solve(others + ridge[:, None, None] * np.eye(count), pulled)
         left = [
-            moved[fold] - features[fold] @ own for fold, own in zip(folds, weights, strict=True)
+            moved[fold] - features[:, fold].T @ own
+            for fold, own in zip(folds, weights, strict=True)
         ]
-        return np.bincount(block, np.square(np.concatenate(left)).sum(axis=1), BLOCKS)
+        return np.bincount(block, _squares(np.concatenate(left)), BLOCKS)
 
     @cached_property
     def _joined(self) -> tuple[np.ndarray, list[int]]:
-        """The actuation (S, m) run after run, and where each run begins."""
+        """The actuation (m, S) run after run, and where each run begins."""
         begins = np.cumsum([0, *(len(part) for part in self.actuation[:-1])]).tolist()
-        return np.concatenate(self.actuation), begins
+        return np.ascontiguousarray(np.concatenate(self.actuation).T), begins
 
 
 @lru_cache(maxsize=64)
@@ -233,10 +234,20 @@ def _folds(count: int) -> tuple[np.ndarray, tuple[slice, ...], np.ndarray]:
 
 
 def _features(actuation: np.ndarray) -> np.ndarray:
-    """(S, k) of actuation (S, m): itself and all products of two."""
-    columns = list(actuation.T)
-    products = [one * other for k, one in enumerate(columns) for other in columns[k:]]
-    return np.stack([*columns, *products], axis=1)
+    """(k, S) of actuation (m, S): itself and all products of two."""
+    count = len(actuation)
+    made = np.empty((count + count * (count + 1) // 2, actuation.shape[1]))
+    made[:count] = actuation
+    first = count
+    for k in range(count):
+        np.multiply(actuation[k], actuation[k:], out=made[first : first + count - k])
+        first += count - k
+    return made
+
+
+def _squares(vectors: np.ndarray) -> np.ndarray:
+    """(S,) squared lengths of vectors (S, d)."""
+    return np.einsum("sd,sd->s", vectors, vectors)
 
 
 def _on(grid: np.ndarray, t_s: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -71,9 +71,9 @@ def evaluation_page(
     )
 
 
-def episode_parts(log: EpisodeLog) -> list:
-    """Charts and events of an episode."""
-    charts = episode_charts(log)
+def episode_parts(log: EpisodeLog, charts: Sequence[Picture] | None = None) -> list:
+    """Charts and events of an episode; charts: what `episode_charts` drew of it, if it did."""
+    charts = episode_charts(log) if charts is None else charts
     wide = [picture for picture in charts if picture.alt.startswith("dose")]
     events = [(f"{e.time_s:.1f} s", e.level, e.text) for e in log.events]
     return [

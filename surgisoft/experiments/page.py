@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +27,14 @@ HOW = (
 
 def experiment_page(
     results: Results,
+    charts: Mapping[tuple[str, int], Sequence[Picture]],
     films: dict[tuple[str, int], Picture],
     about: str,
     notes: Sequence[str] = (),
 ) -> Page:
-    """HTML report of an experiment; films: (setting's label, episode) -> film strip to show.
+    """HTML report of an experiment.
 
+    charts, films: (setting's label, episode) -> charts and film strip to show, in this order.
     notes: what the user was warned of.
     """
     how = results.experiment.of.experiment.how
@@ -43,11 +45,11 @@ def experiment_page(
     sections += _sweeps(results)
     if 1 < len(results.settings) <= SHOWN:
         sections.append(_side_by_side(results))
-    for label, episode in shown_episodes(results):
+    for (label, episode), drawn in charts.items():
         worst = (label, episode) == results.worst and len(results.rows) > 1
         title = f"{'Worst of all: ' if worst else ''}{label}, episode {episode}"
         film = films.get((label, episode))
-        parts = episode_parts(results.log(label, episode))
+        parts = episode_parts(results.log(label, episode), drawn)
         sections.append(Section(title, [*([film] if film else []), *parts]))
     return Page(
         title=f"Experiment {results.experiment.name}",

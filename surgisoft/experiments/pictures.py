@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from surgisoft.agents.report_charts import episode_charts
 from surgisoft.errors import InputError
-from surgisoft.experiments.results import Results
 from surgisoft.files import write_atomically
 from surgisoft.report import Picture
 from surgisoft.tasks.episodes.log import EpisodeLog
@@ -49,18 +47,23 @@ def film(log: EpisodeLog, count: int = PICTURES) -> Picture:
 
 
 def write_pictures(
-    results: Results, shown: Sequence[tuple[str, int]], films: dict[tuple[str, int], Picture]
+    folder: Path,
+    charts: Mapping[tuple[str, int], Sequence[Picture]],
+    films: dict[tuple[str, int], Picture],
 ) -> list[Path]:
-    """`pictures/SETTING-EPISODE-WHAT.svg` (charts) and `.png` (endoscope) of episodes shown."""
-    folder, files = results.folder / "pictures", []
-    folder.mkdir(exist_ok=True)
-    for label, episode in shown:
+    """`pictures/SETTING-EPISODE-WHAT.svg` (charts) and `.png` (endoscope) of episodes shown.
+
+    folder: that of the results; charts, films: those of (setting's label, episode).
+    """
+    place, files = folder / "pictures", []
+    place.mkdir(exist_ok=True)
+    for (label, episode), drawn in charts.items():
         strip = films.get((label, episode))
         named = [] if strip is None else [("endoscope.png", strip)]
-        for picture in episode_charts(results.log(label, episode)):
+        for picture in drawn:
             named.append((f"{picture.alt.replace(' ', '-')}.svg", picture))
         for name, picture in named:
-            path = folder / f"{label}-{episode:04d}-{name}"
+            path = place / f"{label}-{episode:04d}-{name}"
             write_atomically(path, picture.data)
             files.append(path)
     return files

@@ -11,6 +11,7 @@ from typing import Any
 
 from surgisoft.agents.on_rig import rigs_by_arm
 from surgisoft.agents.policies import Policy
+from surgisoft.agents.report_charts import episode_charts
 from surgisoft.agents.run_folder import RunFolder
 from surgisoft.config import read_toml
 from surgisoft.errors import InputError, unknown_name
@@ -265,8 +266,10 @@ def finish_experiment(
     files = write_tables(results)
     logs = {(label, n): results.log(label, n) for label, n in shown_episodes(results)}
     films = {place: film(log) for place, log in logs.items() if log.camera is not None}
-    files += write_pictures(results, list(logs), films)
-    files.append(write_page(experiment_page(results, films, about, notes), folder / "report.html"))
+    charts = {place: episode_charts(log) for place, log in logs.items()}
+    files += write_pictures(folder, charts, films)
+    page = experiment_page(results, charts, films, about, notes)
+    files.append(write_page(page, folder / "report.html"))
     drop_logs(results)
     if replays:
         files += _write_replays(results, progress)

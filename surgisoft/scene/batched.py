@@ -21,7 +21,7 @@ import torch
 
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.scene import frames
-from surgisoft.scene.bvh import TriangleTree, build_tree
+from surgisoft.scene.bvh import TriangleTree, tree_of
 from surgisoft.scene.capsules import (
     HORIZON_MM,
     LONGEST_SEGMENT_MM,
@@ -41,8 +41,8 @@ from surgisoft.scene.distance import (
     longest_steps,
     parts_of_steps,
 )
-from surgisoft.scene.field import MOST_NODES, DistanceField, load_field
-from surgisoft.scene.mesh import Body
+from surgisoft.scene.field import MOST_NODES, DistanceField, cache_folder, load_field
+from surgisoft.scene.mesh import Body, Mesh, kept
 from surgisoft.scene.moving import Placement
 from surgisoft.scene.rays import (
     RayHit,
@@ -125,9 +125,9 @@ class BatchedScene:
         self.stretch = max(1.0, float(stretch))
         margin = 5.0 * math.ceil(self.stretch * (self.horizon_mm + thickest) / 5.0)
         for body in self.bodies:
-            tree = build_tree(body.mesh)
+            tree = tree_of(body.mesh)
             band = 5.0 * math.ceil((thickest + self.exact_within_mm + 5.0) / 5.0)
-            field = load_field(body.mesh, margin, band, most_nodes, tree, cache)
+            field = _field_of(body.mesh, margin, band, most_nodes, cache or cache_folder())
             self._surfaces.append(kind(tree, field, self.device))
             self._trees.append(tree)
 
@@ -809,6 +809,15 @@ class CompiledSurface:
 
         over_rows(len(out), measure)
         return out
+
+
+@kept
+def _field_of(
+    mesh: Mesh, margin_mm: float, band_mm: float, most_nodes: int, folder: Path
+) -> DistanceField:
+    """The field of a mesh, shared by the scenes that hold an equal one: 8 MB, read and checked in a
+    hundredth of a second."""
+    return load_field(mesh, margin_mm, band_mm, most_nodes, tree_of(mesh), folder)
 
 
 def _pose_of(body: Body) -> torch.Tensor:

@@ -19,7 +19,7 @@ from functools import cached_property
 import numpy as np
 
 from surgisoft.compiled import compiled
-from surgisoft.scene.mesh import Mesh
+from surgisoft.scene.mesh import Mesh, kept
 
 
 @compiled
@@ -410,3 +410,9 @@ def build_tree(mesh: Mesh) -> TriangleTree:
     tree = TriangleTree(mesh, order, starts, lower, upper)
     _boxes(tree.triangles_mm, starts, lower, upper)
     return tree
+
+
+@kept
+def tree_of(mesh: Mesh) -> TriangleTree:
+    """The tree of a mesh, shared by the scenes that hold an equal one."""
+    return build_tree(mesh)

@@ -19,7 +19,7 @@ import torch
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.extras import with_advice
 from surgisoft.scene import frames
-from surgisoft.scene.bvh import STACK, TriangleTree, build_tree
+from surgisoft.scene.bvh import STACK, TriangleTree, tree_of
 from surgisoft.scene.capsules import (
     HORIZON_MM,
     ArmShape,
@@ -39,7 +39,7 @@ from surgisoft.scene.distance import (
     nearest_to_surface,
 )
 from surgisoft.scene.inside import points_inside
-from surgisoft.scene.mesh import Body, Mesh
+from surgisoft.scene.mesh import Body, Mesh, kept
 from surgisoft.scene.moving import Placement
 from surgisoft.scene.rays import RayHit, Struck, struck_of
 
@@ -129,6 +129,12 @@ def surface_model(vertices_mm: np.ndarray, faces: np.ndarray) -> fcl.BVHModel:
     model.addSubModel(np.asarray(vertices_mm), np.asarray(faces))
     model.endModel()
     return model
+
+
+@kept
+def _model_of(mesh: Mesh) -> fcl.BVHModel:
+    """FCL's tree of a mesh, shared by the checkers that hold an equal one."""
+    return surface_model(mesh.vertices_mm, mesh.faces)
 
 
 def _placed(geometry, pose: np.ndarray) -> fcl.CollisionObject:
@@ -249,10 +255,7 @@ class CollisionChecker:
         self.horizon_mm = float(horizon_mm)
         self._inward = [frames.invert(body.pose) for body in bodies]
         self._levels: dict[tuple[int, int], tuple[Mesh, fcl.BVHModel]] = {}
-        self._objects = [
-            _placed(surface_model(body.mesh.vertices_mm, body.mesh.faces), body.pose)
-            for body in bodies
-        ]
+        self._objects = [_placed(_model_of(body.mesh), body.pose) for body in bodies]
 
     def __reduce__(self):
         """Pickle the bodies: FCL's objects cannot be pickled, so a copy builds its own."""
@@ -674,7 +677,7 @@ class GuidedChecker:
             mesh = body.mesh
             held = known.get(id(mesh))
             if held is None or held[0] is not mesh:  # a copy of the dict has ids of other meshes
-                held = known[id(mesh)] = mesh, build_tree(mesh)
+                held = known[id(mesh)] = mesh, tree_of(mesh)
             self._trees.append(held[1].arrays)
         self._frames = [(inward[:3, :3].copy(), inward[:3, 3].copy()) for inward in checker._inward]
         self._work = (np.empty(STACK, np.int64), np.empty(STACK))

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from surgisoft.compiled import compiled
 from surgisoft.errors import InputError
-from surgisoft.scene.bvh import STACK, build_tree
+from surgisoft.scene.bvh import STACK, tree_of
 from surgisoft.scene.camera import Camera
 from surgisoft.scene.capsules import self_contact_gap_mm
 from surgisoft.scene.mesh import Body
@@ -257,7 +257,7 @@ def _joined_trees(bodies: Sequence[Body]) -> tuple[np.ndarray, ...]:
     first_start, first_node, faces = [0], [0], 0
     for body in bodies:
         mesh = body.world_mesh
-        tree = build_tree(mesh)
+        tree = tree_of(mesh)
         triangles.append(tree.triangles_mm)
         normals.append(corner_normals(mesh)[tree.order])
         starts.append(tree.starts + faces)

@@ -15,7 +15,7 @@ import numpy as np
 
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
-from surgisoft.scene.bvh import build_tree
+from surgisoft.scene.bvh import tree_of
 from surgisoft.scene.crossings import SAMPLED_MM, crossing_mm
 from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.rays import EmbreeSurface
@@ -48,7 +48,7 @@ class Ring:
 def nearest_on_surface(mesh: Mesh, points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Nearest surface points (N, 3) mm and their faces (N,) to points (N, 3) mm, mesh's frame."""
     points = np.atleast_2d(np.asarray(points_mm, dtype=np.float64))
-    _, faces = build_tree(mesh).nearest(points)
+    _, faces = tree_of(mesh).nearest(points)
     return closest_in_triangles(points, mesh.triangles_mm[faces]), faces
 
 

@@ -6,8 +6,10 @@ Every geometric engine works on these classes. `meshio` reads and writes mesh fi
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache, wraps
+from typing import TypeVar, TypeVarTuple
 
 import numpy as np
 
@@ -15,6 +17,11 @@ from surgisoft.errors import InputError, unknown_name
 from surgisoft.scene import frames
 
 ROLES = ("organ", "keep-out", "support")
+KEPT = 8
+"""Meshes of which `kept` holds what was made, the last ones that were asked for (a count)."""
+
+Given = TypeVarTuple("Given")
+Made = TypeVar("Made")
 
 
 def _frozen(array: np.ndarray) -> np.ndarray:
@@ -124,6 +131,32 @@ class Mesh:
     def transformed(self, pose: np.ndarray) -> Mesh:
         """This mesh moved by a pose (4, 4): vertices in the pose's parent frame."""
         return Mesh(frames.apply(pose, self.vertices_mm), self.faces)
+
+
+@dataclass(frozen=True)
+class _Named:
+    """A mesh, equal to those of equal content."""
+
+    content: str
+    mesh: Mesh = field(compare=False)
+
+
+def kept(make: Callable[[Mesh, *Given], Made]) -> Callable[[Mesh, *Given], Made]:
+    """A function of a mesh whose results are kept, for the next scene with an equal mesh.
+
+    The other arguments have a hash. The last `KEPT` results are kept and shared: they are not to be
+    changed.
+    """
+
+    @lru_cache(maxsize=KEPT)
+    def known(named: _Named, *given: *Given) -> Made:
+        return make(named.mesh, *given)
+
+    @wraps(make)
+    def of(mesh: Mesh, *given: *Given) -> Made:
+        return known(_Named(mesh.content_hash, mesh), *given)
+
+    return of
 
 
 @dataclass(frozen=True, eq=False)

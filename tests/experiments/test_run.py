@@ -20,6 +20,7 @@ from surgisoft.agents.on_rig import RigConfig
 from surgisoft.cli import run
 from surgisoft.errors import InputError
 from surgisoft.experiments import run as experiment_run
+from surgisoft.experiments import session as experiment_session
 from surgisoft.experiments import spec as experiment_spec
 from surgisoft.experiments.page import rules
 from surgisoft.experiments.plan import build_task, settings
@@ -97,6 +98,8 @@ values = [30.0, 40.0, 50.0]
 
 
 def test_a_setting_whose_code_raises_leaves_the_others_their_report(tmp_path, monkeypatch, capsys):
+    """Charts of episodes, which are drawn one by one, are left to the other tests."""
+    monkeypatch.setattr(experiment_session, "episode_charts", lambda log: [])
     text = TINY.replace("repeats = 3", "repeats = 2").replace("together = 1", "together = 2")
     file, folder = write(tmp_path, text + THREE_TIMES), tmp_path / "r"
     play, broken = experiment_run.roll_out_block, ["simulation_cut_s=40"]

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from surgisoft.cli import run
-from surgisoft.measurement.importing.following import following, following_warnings
+from surgisoft.measurement.importing.following import following, following_warnings, warnings_of
 from surgisoft.measurement.importing.timing import body_lead
 from surgisoft.measurement.recordings import Recording
 from tests.measurement.test_recording_timing import RATE_HZ, bent, lagged, played, wander
@@ -74,9 +74,9 @@ FOLLOWS = {
 
 @pytest.mark.parametrize("name", FOLLOWS)
 def test_an_arm_that_follows_in_any_way_is_not_told(name):
-    given = recorded(FOLLOWS[name])
-    assert following_warnings(given, {"measured": 0.0}) == []
-    assert following(given).explained > 0.3
+    found = following(recorded(FOLLOWS[name]))
+    assert warnings_of(found, {"measured": 0.0}) == []
+    assert found.explained > 0.3
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -84,9 +84,10 @@ def test_the_log_of_another_recording_is_told(seed):
     """The actuation of another seed has nothing to do with the body."""
     given = recorded(lambda p: lagged(p, 0.3), seed)
     mixed = replace(given, measured=recorded(seed=seed + 100).measured)
-    (warning,) = following_warnings(mixed, {"measured": 0.0})
+    found = following(mixed)
+    (warning,) = warnings_of(found, {"measured": 0.0})
     assert "the key points hardly follow the actuation" in warning
-    share = max(following(mixed).shifted, 0.0)
+    share = max(found.shifted, 0.0)
     assert f": it explains {share:.0%} of their motion (cross-validated" in warning
     assert "check that the files are of the same recording" in warning
 
@@ -104,7 +105,7 @@ def test_clocks_apart_by_seconds_are_told_from_lags(offset_s, lag_s):
         found = following(apart)
         assert found.apart
         assert found.shift_s == pytest.approx(offset_s + lag_s, abs=0.1)
-        (warning,) = following_warnings(apart, {"measured": 0.0})
+        (warning,) = warnings_of(found, {"measured": 0.0})
         assert f"set delay_s = {-found.shift_s:.3g} in [measured]" in warning
 
 

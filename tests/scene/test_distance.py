@@ -318,6 +318,27 @@ def test_a_cache_that_cannot_be_written_is_no_obstacle(tmp_path):
     assert found.values_mm.min() < 0
 
 
+def test_scenes_with_equal_meshes_read_one_field(tmp_path):
+    """The second one reads no file; a mesh with a vertex elsewhere has another field."""
+    arm = {"a": torch.tensor([[[0.0, 0.0, 30.0], [0.0, 0.0, 60.0]]], dtype=torch.float64)}
+
+    def clearance_mm(mesh, place):
+        bodies = [Body("organ", "organ", mesh)]
+        engine = BatchedScene(bodies, {"a": 5.0}, most_nodes=5_000, cache=tmp_path)
+        assert len(list(tmp_path.iterdir())) == place
+        return float(engine.clearance(arm).least_mm)
+
+    mesh = ball(20.0, 3)
+    first = clearance_mm(mesh, 1)
+    assert first == pytest.approx(5.0, abs=1e-6)
+    for file in tmp_path.iterdir():
+        file.unlink()
+    assert clearance_mm(Mesh(mesh.vertices_mm, mesh.faces), 0) == first
+    moved = np.array(mesh.vertices_mm)
+    moved[np.argmax(moved[:, 2])] *= 1.1
+    assert clearance_mm(Mesh(moved, mesh.faces), 1) == pytest.approx(3.0, abs=1e-6)
+
+
 def test_bad_requests_are_named():
     with pytest.raises(InputError, match="radius of arm 'a' is 0"):
         BatchedScene([], {"a": 0.0})

@@ -1,9 +1,10 @@
-"""Distinct indices and equal rows against `numpy.unique`."""
+"""Distinct indices and equal rows against `numpy.unique`; what is kept of equal meshes."""
 
 import numpy as np
 import pytest
 
-from surgisoft.scene.mesh import equal_rows, used_indices
+from surgisoft.scene.mesh import KEPT, Mesh, equal_rows, kept, used_indices
+from tests.scene.shapes import ball
 
 
 @pytest.mark.parametrize("shape", [(0, 3), (1, 3), (400, 3)])
@@ -29,3 +30,26 @@ def test_equal_rows_are_numpys_unique_of_rows(rows, kind):
     assert np.array_equal(first, expected[1])
     assert np.array_equal(group, expected[2].reshape(-1))
     assert np.array_equal(count, expected[3])
+
+
+def test_what_is_made_of_a_mesh_is_kept_for_equal_ones_and_other_arguments_apart():
+    made = []
+
+    @kept
+    def scaled(mesh, factor):
+        made.append((len(mesh.faces), factor))
+        return factor * mesh.bounds_mm
+
+    one = ball(20.0, 1)
+    first = scaled(one, 2.0)
+    np.testing.assert_array_equal(first, 2.0 * one.bounds_mm)
+    assert scaled(Mesh(one.vertices_mm, one.faces), 2.0) is first
+    moved = np.array(one.vertices_mm)
+    moved[one.faces[0, 0]] *= 1.5
+    for mesh in (Mesh(moved, one.faces), Mesh(one.vertices_mm, one.faces[:, [0, 2, 1]])):
+        np.testing.assert_array_equal(scaled(mesh, 2.0), 2.0 * mesh.bounds_mm)
+    np.testing.assert_array_equal(scaled(one, 3.0), 3.0 * one.bounds_mm)
+    assert len(made) == 4
+    for factor in range(KEPT):
+        scaled(one, float(factor + 10))
+    assert scaled(one, 2.0) is not first, "only the last few are held"

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -196,27 +197,57 @@ class Moves:
 
     def _errors(self, rows, moved: np.ndarray, length: int, shift: int) -> np.ndarray:
         """(BLOCKS,) cross-validated squared error of moves (S, d), block by block [mm^2]."""
-        parts = zip(self.actuation, rows, strict=True)
-        features = np.concatenate(
-            [_features(p[at - shift]) - _features(p[at - shift - length]) for p, at in parts]
-        )
-        block = np.arange(len(moved)) * BLOCKS // len(moved)
-        fold = block % FOLDS
-        grams = [features[fold == k].T @ features[fold == k] for k in range(FOLDS)]
-        pulls = [features[fold == k].T @ moved[fold == k] for k in range(FOLDS)]
-        square = np.empty(len(moved))
-        for k in range(FOLDS):
-            gram, pull = sum(grams) - grams[k], sum(pulls) - pulls[k]
-            gram += max(RIDGE * np.trace(gram) / len(gram), 1e-12) * np.eye(len(gram))
-            left = moved[fold == k] - features[fold == k] @ np.linalg.solve(gram, pull)
-            square[fold == k] = np.square(left).sum(axis=1)
-        return np.bincount(block, square, BLOCKS)
+        order, folds, block = _folds(len(moved))
+        every, begins = self._joined
+        parts = zip(rows, begins, strict=True)
+        at = np.concatenate([at + begin for at, begin in parts])[order] - shift
+        features = _features(every.take(at, axis=1))
+        features -= _features(every.take(at - length, axis=1))
+        moved = moved[order]
+        grams = np.stack([features[:, fold] @ features[:, fold].T for fold in folds])
+        pulls = np.stack([features[:, fold] @ moved[fold] for fold in folds])
+        others, pulled = grams.sum(axis=0) - grams, pulls.sum(axis=0) - pulls
+        count = len(features)
+        ridge = np.maximum(RIDGE * np.trace(others, axis1=1, axis2=2) / count, 1e-12)
+        weights = np.linalg.solve(others + ridge[:, None, None] * np.eye(count), pulled)
+        left = [
+            moved[fold] - features[:, fold].T @ own
+            for fold, own in zip(folds, weights, strict=True)
+        ]
+        return np.bincount(block, _squares(np.concatenate(left)), BLOCKS)
+
+    @cached_property
+    def _joined(self) -> tuple[np.ndarray, list[int]]:
+        """The actuation (m, S) run after run, and where each run begins."""
+        begins = np.cumsum([0, *(len(part) for part in self.actuation[:-1])]).tolist()
+        return np.ascontiguousarray(np.concatenate(self.actuation).T), begins
+
+
+@lru_cache(maxsize=64)
+def _folds(count: int) -> tuple[np.ndarray, tuple[slice, ...], np.ndarray]:
+    """Moves (count,) in order of their folds, where each fold is in it, and each one's block."""
+    block = np.arange(count) * BLOCKS // count
+    fold = block % FOLDS
+    order = np.argsort(fold, kind="stable")
+    ends = np.cumsum(np.bincount(fold, minlength=FOLDS)).tolist()
+    return order, tuple(map(slice, [0, *ends[:-1]], ends)), block[order]
 
 
 def _features(actuation: np.ndarray) -> np.ndarray:
-    """(S, k) of actuation (S, m): itself and all products of two."""
-    first, second = np.triu_indices(actuation.shape[1])
-    return np.concatenate([actuation, actuation[:, first] * actuation[:, second]], axis=1)
+    """(k, S) of actuation (m, S): itself and all products of two."""
+    count = len(actuation)
+    made = np.empty((count + count * (count + 1) // 2, actuation.shape[1]))
+    made[:count] = actuation
+    first = count
+    for k in range(count):
+        np.multiply(actuation[k], actuation[k:], out=made[first : first + count - k])
+        first += count - k
+    return made
+
+
+def _squares(vectors: np.ndarray) -> np.ndarray:
+    """(S,) squared lengths of vectors (S, d)."""
+    return np.einsum("sd,sd->s", vectors, vectors)
 
 
 def _on(grid: np.ndarray, t_s: np.ndarray, values: np.ndarray) -> np.ndarray:

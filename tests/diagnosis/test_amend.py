@@ -203,7 +203,7 @@ def test_an_effect_of_ones_own(lab, tmp_path, capsys):
 
 WRONG = {
     "unknown effect 'magic': known are": {"effect": "magic"},
-    "twist; did you mean 'gain_mismatch'?": {"effect": "gain"},
+    "zero_offset; did you mean 'gain_mismatch'?": {"effect": "gain"},
     "no arm model there": {"model": "nowhere"},
     "is the folder of the model to amend": {"output": "arm"},
     "key points: 3, but the model has 5": {"data": "other.parquet"},

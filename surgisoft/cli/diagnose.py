@@ -224,7 +224,8 @@ def _next_after_setup(setup, model: Path, data: str, of_model: str, apply: str |
         print(f"next: {with_effect_files(f'surgisoft diagnose {typed(model)} {apply}{of_model}')}")
     else:
         again = f"surgisoft diagnose {typed(model)} {data} --apply CORRECTED{of_model}"
-        print(f"next: {with_effect_files(again)}")
+        doubt = ", if the recordings are wrong" if setup.of_model else ""
+        print(f"next{doubt}: {with_effect_files(again)}")
 
 
 def _show_setup(setup) -> None:

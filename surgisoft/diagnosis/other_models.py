@@ -8,7 +8,7 @@ change when the whole actuation is offset, so the polynomial's slope is that of 
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -220,6 +220,49 @@ def predicted_arm(
     return _validated(model, None if error_mm is None else (error_mm,), before, name)
 
 
+@dataclass(frozen=True)
+class LengthUnit:
+    """That a model's key points are in another unit of length than mm."""
+
+    true: str
+    """Unit of the values."""
+    read: str
+    """Unit that they were read as: mm where nothing was converted."""
+    model_mm: float
+    """Length of the model's body along its key points, as read, mm."""
+    measured_mm: float
+    """The same of the measured key points, mm."""
+
+    @property
+    def factor(self) -> float:
+        """What the model's positions have to be multiplied by."""
+        return MM_PER[self.true] / MM_PER[self.read]
+
+
+def wrong_length_unit(
+    points: np.ndarray, recordings: Sequence[Recording], length_mm: float | None
+) -> LengthUnit | None:
+    """The wrong unit of length of a model's key points (T, n, 3); None where none is proved.
+
+    A model's unit is wrong where its body is longer or shorter than the measured one by the ratio
+    of two units, and the measured one is nearer to the stated length. Where that is not known, or
+    there is one key point, the unit of the recordings may be wrong as well.
+    """
+    if length_mm is None or points.shape[1] != recordings[0].key_points:
+        return None
+    gaps = np.stack([_gaps_mm([points]), _gaps_mm([each.key_points_mm for each in recordings])])
+    model_mm, measured_mm = gaps[:, np.isfinite(gaps).all(0)].sum(1).tolist()
+    if not (model_mm > 0 and measured_mm > 0):
+        return None
+    if abs(np.log(measured_mm / length_mm)) >= abs(np.log(model_mm / length_mm)):
+        return None
+    found = (LengthUnit(*pair, model_mm, measured_mm) for pair in LENGTH_UNITS)
+    same = np.log(SAME_LENGTH)
+    return next(
+        (each for each in found if abs(np.log(each.factor * model_mm / measured_mm)) <= same), None
+    )
+
+
 def _check_length_unit(
     what: str,
     advice: str,
@@ -227,31 +270,17 @@ def _check_length_unit(
     recordings: Sequence[Recording],
     length_mm: float | None,
 ) -> None:
-    """Raise InputError where a model's key points are in another unit of length than mm.
-
-    points: (T, n, 3) key points of the model; what, advice: begin and end of the message. A
-    model's unit is wrong where its body is longer or shorter than the measured one by the ratio of
-    two units, and the measured one is nearer to the stated length. Where that is not known, or
-    there is one key point, the unit of the recordings may be wrong: the set-up tests say so.
-    """
-    if length_mm is None or points.shape[1] != recordings[0].key_points:
+    """Raise InputError where `wrong_length_unit` finds one; what, advice: begin and end of it."""
+    found = wrong_length_unit(points, recordings, length_mm)
+    if found is None:
         return
-    gaps = np.stack([_gaps_mm([points]), _gaps_mm([each.key_points_mm for each in recordings])])
-    model_mm, measured_mm = gaps[:, np.isfinite(gaps).all(0)].sum(1)
-    if not (model_mm > 0 and measured_mm > 0):
-        return
-    if abs(np.log(measured_mm / length_mm)) >= abs(np.log(model_mm / length_mm)):
-        return
-    for true, read in LENGTH_UNITS:
-        factor = MM_PER[true] / MM_PER[read]
-        if abs(np.log(factor * model_mm / measured_mm)) > np.log(SAME_LENGTH):
-            continue
-        wrong = f"in {PLURAL.get(true, true)}" if factor > 1 else f"{1 / factor:g} times too large"
-        raise InputError(
-            f"{what} {wrong}: along the body, base to tip, they are {model_mm:.3g} long, where "
-            f"{measured_mm:.3g} mm are measured and the arm is {length_mm:.4g} mm long; "
-            f"{advice.format(factor)}"
-        )
+    by = found.factor
+    wrong = f"in {PLURAL.get(found.true, found.true)}" if by > 1 else f"{1 / by:g} times too large"
+    raise InputError(
+        f"{what} {wrong}: along the body, base to tip, they are {found.model_mm:.3g} long, where "
+        f"{found.measured_mm:.3g} mm are measured and the arm is {length_mm:.4g} mm long; "
+        f"{advice.format(by)}"
+    )
 
 
 def _gaps_mm(points: Sequence[np.ndarray]) -> np.ndarray:

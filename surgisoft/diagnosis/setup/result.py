@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from surgisoft.diagnosis.other_models import has_slope, is_of_other_origin
+from surgisoft.diagnosis.other_models import has_slope, is_of_other_origin, wrong_length_unit
 from surgisoft.diagnosis.residuals import (
     EVERY_ROW,
     fit_of_model,
@@ -95,6 +95,8 @@ class SetupResult:
     """Whether the recordings can be corrected without recording again."""
     correction: Correction
     """The correction of a recording."""
+    of_model: str = ""
+    """How the model may be wrong in place of the recordings; empty where it is not."""
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -121,6 +123,7 @@ class SetupResult:
             "instructions": self.instructions,
             "alternative_instructions": list(self.alternative_instructions),
             "how_to_tell": self.how_to_tell,
+            "of_model": self.of_model,
             "before_mm": self.before_mm,
             "after_mm": self.after_mm,
             "floor_mm": self.floor_mm,
@@ -321,6 +324,7 @@ class _Report:
             recordings=tuple(recording.name for recording in self.recordings),
             correctable=correctable,
             correction=correction,
+            of_model="; or ".join(of_model),
         )
 
     @property
@@ -344,14 +348,16 @@ class _Report:
     def _length_of_model(self, given: Hypothesis) -> tuple[str, ...]:
         """That the model may be in another unit of length, and not the recordings.
 
-        Only of a callable or predictions, and only where the stated length cannot tell: elsewhere
-        such a model was refused when it was opened.
+        Only of a callable or predictions, and not where the stated length tells that the unit of
+        the recordings is wrong.
         """
-        spec = self.model.spec
-        known = spec.length_mm is not None and spec.key_points > 1
-        unit = given.mm_per_unit
-        if unit == 1.0 or known or not is_of_other_origin(self.model):
+        spec, unit = self.model.spec, given.mm_per_unit
+        if unit == 1.0 or not is_of_other_origin(self.model):
             return ()
+        if spec.length_mm is not None and spec.key_points > 1:
+            at_rest = self.model.rest_mm.double().numpy()[None]
+            if wrong_length_unit(at_rest, self.recordings, spec.length_mm) is None:
+                return ()
         return (model_in_other_unit(1 / unit),)
 
     def _time_unit(self) -> list[SetupFault]:

@@ -93,6 +93,9 @@ def test_a_wrong_unit_of_one_key_point_may_be_that_of_the_model():
     model = callable_arm(given_callable(in_metres), [bench()], error_mm=VALIDATED_MM)
     result = find_setup_faults(model, [bench()])
     assert "mm were read as m; or the model returns m where mm are expected" in result.sentence
+    assert result.of_model == "the model returns m where mm are expected"
+    assert result.to_json()["of_model"] == result.of_model
+    assert found(FAULTS["turned"][0](bench())).of_model == ""
     assert result.how_to_tell == "to distinguish them: compare a distance with a ruler"
 
 

@@ -277,7 +277,7 @@ def test_a_knock_is_told_where_a_turn_at_one_moment_explains_more(found):
     assert found["creep"].statistics.sudden_log_gain == 0.0
     assert found["creep"].statistics.sudden_at_s == 0.0
     defined = {row.effect for row in turned.effects if row.by_definition}
-    assert defined == {"misalignment", "gain_mismatch"}
+    assert defined == {"misalignment", "gain_mismatch", "zero_offset"}
     sudden = replace(turned, sudden_margin=3.0, sudden_at_s=83.04)
     assert knock(sudden).endswith(" at 83 s, as by a knock, explains more than misalignment")
     assert " at 83 s (all recordings in turn), as by" in knock(sudden, recordings=2)

@@ -167,8 +167,8 @@ REASONS_OF_OTHERS = REASONS | {
     "static": "a function of the actuation alone explains most of the error, which is {size}: "
     "correct the parameters or the form of the model",
     "learned": "the error is {size}, and a black box with memory explains a part of it that no "
-    "static function explains, so the parameters of the model stand for a part of the missing "
-    "effect",
+    "static function explains, so the parameters of the model may make up for a part of the "
+    "missing effect",
     "announced": "the error is {size}, and most probably it is the model's own: its parameters or "
     "its form are off",
 }

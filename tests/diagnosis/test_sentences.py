@@ -222,7 +222,7 @@ PAGE = "surgisoft compare {model} {data}{before} --report PAGE"
         (None, False, "most probably it is the model's own: its parameters or its form are off;"),
         ("network", False, "the model does not describe this arm: correct its parameters, its fr"),
         ("network", True, "explains most of the error, which is 1.25 times the model's validated"),
-        ("learned", False, "so the parameters of the model stand for a part of the missing effec"),
+        ("learned", False, "so the parameters of the model may make up for a part of the missin"),
     ],
 )
 def test_a_model_of_other_origin_is_not_to_be_replaced_by_a_network(reason, static, said):

@@ -131,7 +131,7 @@ def test_a_fall_is_claimed_where_it_is_certain_large_and_due_to_the_effects():
     assert fall(fall=1e-4, ci95=(1e-5, 2e-4)).sentence.endswith("is too small")
     assert not fall(p_value=0.9).claimed
     assert (
-        "may be the network's own error, which the effect resembles (p 0.9)"
+        "may be the model's own error, which the effect resembles (p 0.9)"
         in fall(p_value=0.9).sentence
     )
     changed = amendment(change=CHANGE, model_error=fall(2.0, 1.5), retuned=True)

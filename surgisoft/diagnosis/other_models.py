@@ -8,7 +8,7 @@ change when the whole actuation is offset, so the polynomial's slope is that of 
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -67,10 +67,10 @@ LENGTH_UNITS = tuple(
 """Wrong readings of a model's key points: the true unit, and the one that they were read as."""
 COLUMNS_BY_UNIT = "expected columns named by the unit of their values, such as k0_x_mm or k0_x_m"
 """What to do about a file of predictions in another unit than its columns say."""
-SAME_LENGTH = 1.3
+SAME_LENGTH = 1.5
 """Ratio up to which the body of a model and the measured one are equally long, once a wrong unit of
-length is corrected: far below the smallest ratio of two units (2.54), and above what the key points
-of a poor model of the arm are off along the body."""
+length is corrected: an arm that stretches is longer than at rest. Its square is less than the
+smallest ratio of two factors that are tried (2.54), so that one factor at most is found."""
 
 Given = Iterable[Recording | str | Path] | Recording | str | Path
 """Recordings, their files, or folders of them."""
@@ -220,47 +220,27 @@ def predicted_arm(
     return _validated(model, None if error_mm is None else (error_mm,), before, name)
 
 
-@dataclass(frozen=True)
-class LengthUnit:
-    """That a model's key points are in another unit of length than mm."""
+class BodyLengths(NamedTuple):
+    """How long a body is along its key points that a model and the recordings both have, mm."""
 
-    true: str
-    """Unit of the values."""
-    read: str
-    """Unit that they were read as: mm where nothing was converted."""
     model_mm: float
-    """Length of the model's body along its key points, as read, mm."""
+    """At rest, or as the median of predictions, by a model."""
     measured_mm: float
-    """The same of the measured key points, mm."""
+    """As the median of the recordings."""
 
-    @property
-    def factor(self) -> float:
-        """What the model's positions have to be multiplied by."""
-        return MM_PER[self.true] / MM_PER[self.read]
+    def blame_model(self, length_mm: float) -> bool:
+        """Whether the measured body is nearer to the stated length than the model's."""
+        model, measured = (abs(np.log(each / length_mm)) for each in self)
+        return bool(measured < model)
 
 
-def wrong_length_unit(
-    points: np.ndarray, recordings: Sequence[Recording], length_mm: float | None
-) -> LengthUnit | None:
-    """The wrong unit of length of a model's key points (T, n, 3); None where none is proved.
-
-    A model's unit is wrong where its body is longer or shorter than the measured one by the ratio
-    of two units, and the measured one is nearer to the stated length. Where that is not known, or
-    there is one key point, the unit of the recordings may be wrong as well.
-    """
-    if length_mm is None or points.shape[1] != recordings[0].key_points:
+def body_lengths(points: np.ndarray, recordings: Sequence[Recording]) -> BodyLengths | None:
+    """Both lengths, from key points (T, n, 3) of a model; None where one is not known."""
+    if points.shape[1] != recordings[0].key_points:
         return None
     gaps = np.stack([_gaps_mm([points]), _gaps_mm([each.key_points_mm for each in recordings])])
-    model_mm, measured_mm = gaps[:, np.isfinite(gaps).all(0)].sum(1).tolist()
-    if not (model_mm > 0 and measured_mm > 0):
-        return None
-    if abs(np.log(measured_mm / length_mm)) >= abs(np.log(model_mm / length_mm)):
-        return None
-    found = (LengthUnit(*pair, model_mm, measured_mm) for pair in LENGTH_UNITS)
-    same = np.log(SAME_LENGTH)
-    return next(
-        (each for each in found if abs(np.log(each.factor * model_mm / measured_mm)) <= same), None
-    )
+    found = BodyLengths(*gaps[:, np.isfinite(gaps).all(0)].sum(1).tolist())
+    return found if min(found) > 0 else None
 
 
 def _check_length_unit(
@@ -270,17 +250,26 @@ def _check_length_unit(
     recordings: Sequence[Recording],
     length_mm: float | None,
 ) -> None:
-    """Raise InputError where `wrong_length_unit` finds one; what, advice: begin and end of it."""
-    found = wrong_length_unit(points, recordings, length_mm)
-    if found is None:
+    """Raise InputError where a model's key points (T, n, 3) are in another unit of length than mm.
+
+    They are where its body is longer or shorter than the measured one by the ratio of two units,
+    and the measured one is nearer to the stated length. Where that is not known, or there is one
+    key point, the unit of the recordings may be wrong as well: the set-up tests say so. what,
+    advice: begin and end of the message.
+    """
+    found = body_lengths(points, recordings)
+    if found is None or length_mm is None or not found.blame_model(length_mm):
         return
-    by = found.factor
-    wrong = f"in {PLURAL.get(found.true, found.true)}" if by > 1 else f"{1 / by:g} times too large"
-    raise InputError(
-        f"{what} {wrong}: along the body, base to tip, they are {found.model_mm:.3g} long, where "
-        f"{found.measured_mm:.3g} mm are measured and the arm is {length_mm:.4g} mm long; "
-        f"{advice.format(by)}"
-    )
+    for true, read in LENGTH_UNITS:
+        by = MM_PER[true] / MM_PER[read]
+        if abs(np.log(by * found.model_mm / found.measured_mm)) > np.log(SAME_LENGTH):
+            continue
+        wrong = f"in {PLURAL.get(true, true)}" if by > 1 else f"{1 / by:g} times too large"
+        raise InputError(
+            f"{what} {wrong}: along the body, base to tip, they are {found.model_mm:.3g} long, "
+            f"where {found.measured_mm:.3g} mm are measured and the arm is {length_mm:.4g} mm "
+            f"long; {advice.format(by)}"
+        )
 
 
 def _gaps_mm(points: Sequence[np.ndarray]) -> np.ndarray:

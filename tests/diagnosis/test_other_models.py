@@ -247,3 +247,16 @@ def test_the_stated_length_tells_whose_unit_is_wrong(loaded):
         wrong = replace(loaded, key_points_mm=by * loaded.key_points_mm)
         callable_arm(given_callable(whole_runs), [wrong])
     callable_arm(given_callable(scaled(1e-3)), [with_length(loaded, None)])
+
+
+def test_the_set_up_tests_leave_open_whose_unit_is_wrong_only_where_no_length_tells(loaded):
+    """The recording is in cm; without a length the model may be ten times too large."""
+    right = callable_arm(given_callable(whole_runs), [loaded])
+    in_cm = replace(loaded, key_points_mm=loaded.key_points_mm / 10)
+    told = find_setup_faults(right, [in_cm])
+    assert told.kinds == ("length_unit",)
+    assert told.of_model == ""
+    unknown = right.replace(spec=replace(right.spec, length_mm=None)).eval()
+    either = find_setup_faults(unknown, [in_cm])
+    assert either.of_model == "the positions of the model are 10 times too large"
+    assert either.sentence.startswith(f"{told.sentence.partition(':')[0]}; or {either.of_model}:")

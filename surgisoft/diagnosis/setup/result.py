@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from surgisoft.diagnosis.other_models import has_slope, is_of_other_origin, wrong_length_unit
+from surgisoft.diagnosis.other_models import body_lengths, has_slope, is_of_other_origin
 from surgisoft.diagnosis.residuals import (
     EVERY_ROW,
     fit_of_model,
@@ -354,10 +354,9 @@ class _Report:
         spec, unit = self.model.spec, given.mm_per_unit
         if unit == 1.0 or not is_of_other_origin(self.model):
             return ()
-        if spec.length_mm is not None and spec.key_points > 1:
-            at_rest = self.model.rest_mm.double().numpy()[None]
-            if wrong_length_unit(at_rest, self.recordings, spec.length_mm) is None:
-                return ()
+        lengths = body_lengths(self.model.rest_mm.double().numpy()[None], self.recordings)
+        if lengths and spec.length_mm and not lengths.blame_model(spec.length_mm):
+            return ()
         return (model_in_other_unit(1 / unit),)
 
     def _time_unit(self) -> list[SetupFault]:

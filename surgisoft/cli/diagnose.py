@@ -146,7 +146,8 @@ def diagnose(
     of_model = model_options((predictions or [])[: len(measured)], model_error)
     following = ""
     if found.next_command:
-        command = found.command(typed(model), data, before_files(before, paired))
+        pairing, earlier_files = before_files(before, paired), typed_once(before or [])
+        command = found.command(typed(model), data, pairing, earlier_files)
         predicted = bool(predictions) or model.suffix in (".csv", ".parquet")
         of_all = model_options(predictions, model_error) if "--before" in command else of_model
         following = _following(command, predicted, of_all)
@@ -205,7 +206,7 @@ def _following(command: str, predicted: bool, of_model: str) -> str:
     predicted: whether the model is given by predictions, which cannot be amended.
     """
     name = command.split()[1]
-    if name == "amend" and predicted:
+    if name in ("amend", "improve") and predicted:
         return (
             "give the model as a callable (docs/your_model.md) to amend it: predictions of "
             "recorded rows cannot be amended"
@@ -223,7 +224,8 @@ def _next_after_setup(setup, model: Path, data: str, of_model: str, apply: str |
         print(f"next: {with_effect_files(f'surgisoft diagnose {typed(model)} {apply}{of_model}')}")
     else:
         again = f"surgisoft diagnose {typed(model)} {data} --apply CORRECTED{of_model}"
-        print(f"next: {with_effect_files(again)}")
+        doubt = ", if the recordings are wrong" if setup.of_model else ""
+        print(f"next{doubt}: {with_effect_files(again)}")
 
 
 def _show_setup(setup) -> None:

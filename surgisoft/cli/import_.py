@@ -50,8 +50,8 @@ def import_(
         typer.Option(
             "--delay-s",
             metavar="S",
-            help="Delay of the log of the actuation, s, in place of delay_s in [measured] (and "
-            "[commanded], if it is in the same file) of the map, which then serves recordings "
+            help="Delay of the log of the actuation, s, in place of delay_s in the table measured "
+            "(and commanded, if it is in the same file) of the map, which then serves recordings "
             "whose clocks were started by hand.",
         ),
     ] = None,

@@ -128,7 +128,8 @@ def improve(
         last = output if result.claimed else model
         # What was amended to a change is not compared with the recordings from before it again.
         earlier_files = None if result.claimed else before
-        given = (typed_once(recordings), before_files(earlier_files, paired))
+        pairing, alone = before_files(earlier_files, paired), typed_once(before or [])
+        given = (typed_once(recordings), pairing, alone)
         of_last = "" if result.claimed else model_options(None, model_error)
         command = _command(result.diagnoses[-1], typed(last), given, of_last)
         written += write_improve_report(result, tables, report, title, command)
@@ -143,7 +144,7 @@ def improve(
         print(f"{output} was not written")
         if result.interrupted:
             raise typer.Exit(INTERRUPTED)
-        read = typed_once(recordings), before_files(before, paired)
+        read = typed_once(recordings), before_files(before, paired), typed_once(before or [])
         if again := _following(result, typed(model), read, model_options(None, model_error)):
             print(f"next: {again}")
         raise typer.Exit(NOT_CLAIMED)
@@ -170,11 +171,12 @@ def improve(
     print(f"next, both models on an unseen recording: {following}")
 
 
-def _following(result, model: str, files: tuple[str, str], of_model: str) -> str:
+def _following(result, model: str, files: tuple[str, str, str], of_model: str) -> str:
     """The command to run next where nothing was added: what `diagnose` recommends; empty where that
     is to add the effect that did not lower the error.
 
-    model, files: the model, the recordings and those of `--before`, as they are typed.
+    model, files: the model, the recordings, those of `--before` with how to pair them, and those
+    alone, as they are typed.
     """
     from surgisoft.diagnosis.decision import NAMING
 
@@ -187,7 +189,7 @@ def _following(result, model: str, files: tuple[str, str], of_model: str) -> str
     return "" if found.verdict.kind in NAMING else _command(found, model, files, of_model)
 
 
-def _command(found, model: str, files: tuple[str, str], of_model: str) -> str:
+def _command(found, model: str, files: tuple[str, str, str], of_model: str) -> str:
     """What a diagnosis recommends, as a command with the options of its model; empty without."""
     if not found.next_command:
         return ""

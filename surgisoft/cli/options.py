@@ -235,7 +235,7 @@ Force = Annotated[bool, Option("--force", help="Replace the output of an earlier
 
 _RIG = (
     "Rig: a name with its options, such as virtual, elastica or serial ('surgisoft rig list' shows "
-    "all), or package.module:object."
+    "all), package.module:object or FILE.py:object."
 )
 Rig = Annotated[str, Option("--rig", metavar="NAME[:option=value,...]", is_eager=True, help=_RIG)]
 RigsOfArms = Annotated[

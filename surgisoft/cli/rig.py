@@ -17,7 +17,10 @@ app.add_typer(commands, name="rig")
 def list_(
     name: Annotated[
         str | None,
-        typer.Argument(metavar="NAME", help="Show this rig only, or package.module:object."),
+        typer.Argument(
+            metavar="NAME",
+            help="Show this rig only; also package.module:object or FILE.py:object.",
+        ),
     ] = None,
 ) -> None:
     """List the rigs and the options of each: NAME:option=value,..."""

@@ -125,9 +125,7 @@ class Fall:
         if low <= 0:
             why = "is not significant"
         elif self._matters:
-            why = (
-                f"may be the network's own error, which the effect resembles (p {self.p_value:.2g})"
-            )
+            why = f"may be the model's own error, which the effect resembles (p {self.p_value:.2g})"
         return f"no reduction of the error is claimed: {numbers} {why}"
 
     def numbers(self, where: str) -> str:

@@ -144,10 +144,12 @@ def data_quality_warnings(problem: Problem) -> list[str]:
         )
     far = _far_from_fit(problem)
     if far > FAR_ROWS:
+        where = "those that the model was fitted on, where its own error is larger"
+        if problem.model.training_residuals is None:
+            where = "those of the recordings from before, where the model's own error is not known"
         warnings.append(
-            f"{100 * far:.0f} % of the rows are at actuations far from those that the model was "
-            "fitted on, where its own error is larger: an effect that shows there alone may be an "
-            "error of the model"
+            f"{100 * far:.0f} % of the rows are at actuations far from {where}: an effect that "
+            "shows there alone may be an error of the model"
         )
     validated = problem.model.validation.rmse_mm
     noise = problem.floor_mm

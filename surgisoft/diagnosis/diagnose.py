@@ -67,7 +67,7 @@ from surgisoft.diagnosis.inputs import (
     with_known_residuals,
 )
 from surgisoft.diagnosis.known_error import known_error, rows_of_fit
-from surgisoft.diagnosis.other_models import open_model
+from surgisoft.diagnosis.other_models import is_of_other_origin, open_model
 from surgisoft.diagnosis.pairs import BeforeAfter, Change, ChangeTrack, Paired, before_and_after
 from surgisoft.diagnosis.refit import LINE_OR_WALL, Refit, beside, can_hide, refit_reason
 from surgisoft.diagnosis.refit import refit as fit_candidates_together
@@ -161,6 +161,23 @@ REASONS = {
 }
 """Why a diagnosis cannot tell, or why it calls the model off, in words; {size}: the error beside
 the validated one (`ErrorLevels.size`)."""
+REASONS_OF_OTHERS = REASONS | {
+    "network": "the error is {size}, so the model does not describe this arm: correct its "
+    "parameters, its frame or its form",
+    "static": "a function of the actuation alone explains most of the error, which is {size}: "
+    "correct the parameters or the form of the model",
+    "learned": "the error is {size}, and a black box with memory explains a part of it that no "
+    "static function explains, so the parameters of the model may make up for a part of the "
+    "missing effect",
+    "announced": "the error is {size}, and most probably it is the model's own: its parameters or "
+    "its form are off",
+}
+"""The same of a callable or of predictions, which `surgisoft fit` did not make."""
+OWN_ERROR_FIRST = "surgisoft improve {model} {earlier} -o NEW"
+"""What to run where a change is no larger than the own error of such a model: first lower that, by
+recordings from before the change."""
+FIT_BEFORE = "surgisoft fit {earlier} -o NEW"
+"""The same for a fitted model: recordings after a change would hide it from the new one."""
 
 FAR_BEHIND = 0.05
 """Probability of the second effect of a set below which the sentence names the first: of 21 such
@@ -168,6 +185,8 @@ sets on judged robots the first was missing in 17, the second in one."""
 MOSTLY_SMOOTH = 0.5
 """Share of the error below which the discrepancy of the model alone, without an effect, leaves so
 little that the sentence has to say so: a half."""
+WHERE_IT_ACTS = "surgisoft compare {model} {data}{before} --report PAGE"
+"""What to run to see when, where along the body and at which actuations a model errs."""
 CANNOT_TELL = "cannot tell what is missing, if anything"
 """Begin of the sentence of `cannot_tell`."""
 WITHOUT_SLIP = "surgisoft diagnose {model} REC_BEFORE_THE_SLIP{before}"
@@ -326,8 +345,9 @@ class Diagnosis:
     probabilities: Probabilities | None = None
     """Calibrated probabilities of what is true."""
     next_command: str = ""
-    """What to do, as a command with `{model}`, `{data}` and `{before}` (the option with recordings
-    from before, or nothing) for the files; empty where nothing is to be done."""
+    """What to do, as a command with `{model}`, `{data}`, `{before}` (the option with recordings
+    from before, or nothing) and `{earlier}` (these recordings) for the files; empty where nothing
+    is to be done."""
     setup: SetupResult | None = None
     """What is wrong with the set-up of the recordings; None where no fault is proved."""
     change: Change | None = None
@@ -353,15 +373,21 @@ class Diagnosis:
         return LEFT_OUT if self.in_fit else HELD_OUT
 
     def command(
-        self, model: str = "MODEL", data: str = "RECORDINGS", before: str = "BEFORE"
+        self,
+        model: str = "MODEL",
+        data: str = "RECORDINGS",
+        before: str = "BEFORE",
+        earlier: str = "BEFORE",
     ) -> str:
         """`next_command` with its files, in words for those that are not given.
 
         model, data, before: as they are typed in a shell (`surgisoft.command_line.typed`).
-        before: the recordings from before, which are left out where none were compared, or empty.
+        before: the recordings from before, with how to pair them, which are left out where none
+        were compared, or empty. earlier: the recordings from before by themselves.
         """
         option = f" --before {before}" if self.change is not None and before else ""
-        return self.next_command.format(model=model, data=data, before=option)
+        names = {"model": model, "data": data, "before": option, "earlier": earlier}
+        return self.next_command.format(**names)
 
     @property
     def in_words(self) -> tuple[tuple[str, str], ...]:
@@ -648,7 +674,17 @@ def since(result: Diagnosis, both: BeforeAfter, found: Findings) -> Diagnosis:
         # Effects that cannot be told apart are alternatives, which do not act at once.
         acting = verdict.effects[:1] if verdict.kind == "ambiguous" else verdict.effects
         track = both.track(found.problem, found.explained_mm(acting))
-    return replace(result, change=both.change, track=track, verdict=replace(verdict, sentence=text))
+    command = result.next_command
+    if verdict.kind == "surrogate_undertrained" and not verdict.reason:
+        other_origin = is_of_other_origin(found.problem.model)
+        command = OWN_ERROR_FIRST if other_origin else FIT_BEFORE
+    return replace(
+        result,
+        change=both.change,
+        track=track,
+        verdict=replace(verdict, sentence=text),
+        next_command=command,
+    )
 
 
 def without_before(both: BeforeAfter) -> Diagnosis:
@@ -844,7 +880,8 @@ def result_of(
     ranking = tuple(_ranked(found, score, decision) for score in _order(found, decision))
     static = evidence.free_static >= MOSTLY_STATIC * evidence.free_box
     near, reached = nearest(ranking), _reached(found, effects, kind)
-    sentence = sentence_of(decision, levels, reached, where, static, near)
+    fitted = not is_of_other_origin(problem.model)
+    sentence = sentence_of(decision, levels, reached, where, static, near, fitted)
     if other_arm:
         sentence = f"{CANNOT_TELL}: {other_arm}; {levels.in_words}"
     others = _instead(evidence) if kind == "several" else ()
@@ -858,7 +895,7 @@ def result_of(
     told = slipped(evidence, recordings)
     if not told or evidence.jump_count > 1:
         told += jumping(evidence, recordings)
-    command = next_command(decision, problem.model.trainable)
+    command = next_command(decision, problem.model.trainable, fitted)
     if kind == "unknown_effect":
         if slipped(evidence):
             command = before_the_slip(evidence, problem.table)
@@ -877,7 +914,7 @@ def result_of(
             *(collinear_hints(problem.table) if kind in NAMING else ()),
             *told,
             *(local_error(along, recordings) if kind not in NAMING else ()),
-            *would_explain(found, decision),
+            *would_explain(found, decision, fitted),
             *second_too(decision),
             *smooth_error(levels, decision),
             *amplitudes_that_vary(evidence, decision),
@@ -910,8 +947,11 @@ def of_another_arm(found: Findings, decision: Decision) -> str:
     )
 
 
-def would_explain(found: Findings, decision: Decision) -> list[str]:
-    """Share that an effect would explain of an error that the fit had already."""
+def would_explain(found: Findings, decision: Decision, fitted: bool = True) -> list[str]:
+    """Share that an effect would explain of an error that the fit had already.
+
+    fitted: whether `surgisoft fit` made the model.
+    """
     if decision.kind not in ("nothing_missing", "surrogate_undertrained", "cannot_tell"):
         return []
     if not found.first or found.selection.whole_size >= 1.0:
@@ -923,9 +963,9 @@ def would_explain(found: Findings, decision: Decision) -> list[str]:
     text = (
         f"{best.effect} would explain {100 * best.gain:.0f} % of the explainable error, but the "
         f"error is no larger than the model's validated error (both without their noise), so an "
-        f"error of the fit explains it as well"
+        f"error of the {'fit' if fitted else 'model'} explains it as well"
     )
-    if known_effects()[best.effect].stage in FRONT:
+    if fitted and known_effects()[best.effect].stage in FRONT:
         text += f"; fit the network together with it (fit --effects {best.effect}) and compare"
     return [text]
 
@@ -1216,11 +1256,12 @@ def sentence_of(
     where: str = HELD_OUT,
     static: bool = False,
     near: str | None = None,
+    fitted: bool = True,
 ) -> str:
     """The verdict in words. reached: error with the named effects, or with each of a set, on blocks
     that these were not fitted to, mm; where: these blocks in words; static: whether a function of
     the actuation alone explains most of what can be explained; near: the effect that comes nearest
-    to an unknown one."""
+    to an unknown one; fitted: whether `surgisoft fit` made the model."""
     kind, effects, sure = decision.kind, decision.effects, decision.confidence
     error = levels.in_words
     if kind == "identified":
@@ -1252,11 +1293,11 @@ def sentence_of(
             f"{f'nearest: {near}' if near else 'none is near'}); {error}"
         )
     if kind == "surrogate_undertrained":
-        why = _why(decision.reason or "announced", levels, static)
+        why = _why(decision.reason or "announced", levels, static, fitted)
         head = f"the model itself is off (confidence {sure:.2f}), so no effect is sought yet"
         return f"{head}: {why}; {error}"
     if kind == "cannot_tell":
-        why = _why(decision.reason or "schedule", levels, static)
+        why = _why(decision.reason or "schedule", levels, static, fitted)
         most = _most_probable(decision)
         most = f" (most probable: {most})" if most else ""
         return f"{CANNOT_TELL}: {why}{most}; {error}"
@@ -1281,11 +1322,11 @@ def _one_alone(decision: Decision, reached: Sequence[float]) -> str:
     return f", which makes it {least} with a probability of {alone:.2f} only"
 
 
-def _why(reason: str, levels: ErrorLevels, static: bool) -> str:
+def _why(reason: str, levels: ErrorLevels, static: bool, fitted: bool) -> str:
     """A reason in words: what is said of the error follows from the numbers."""
     if reason == "network" and static:
         reason = "static"
-    return REASONS[reason].format(size=levels.size)
+    return (REASONS if fitted else REASONS_OF_OTHERS)[reason].format(size=levels.size)
 
 
 def _most_probable(decision: Decision) -> str:
@@ -1304,10 +1345,11 @@ def _most_probable(decision: Decision) -> str:
     return ", ".join(f"{words} {chance:.2f}" for words, chance in most[:2])
 
 
-def next_command(decision: Decision, trainable: bool = True) -> str:
+def next_command(decision: Decision, trainable: bool = True, fitted: bool = True) -> str:
     """Command to run after a result, with `{model}`, `{data}` and `{before}` for the files.
 
-    trainable: whether the model can be trained on together with effects.
+    trainable: whether the model can be trained on together with effects. fitted: whether `surgisoft
+    fit` made the model; to another one a fit of a network to the recordings is no answer.
     """
     kind, names = decision.kind, decision.effects
     if kind in ("identified", "several"):
@@ -1323,9 +1365,12 @@ def next_command(decision: Decision, trainable: bool = True) -> str:
     plan += " -o SCHEDULE.csv"
     if kind == "ambiguous":
         return plan
-    if decision.reason in ("network", "arm") or (
+    off = decision.reason in ("network", "arm") or (
         kind == "surrogate_undertrained" and not decision.reason
-    ):
+    )
+    if not fitted and (off or decision.reason == "learned"):
+        return WHERE_IT_ACTS
+    if off:
         return "surgisoft fit {data} -o NEW"
     if decision.reason == "learned" and trainable:
         return "surgisoft diagnose {model} {data} --refit always"
@@ -1336,8 +1381,8 @@ def next_command(decision: Decision, trainable: bool = True) -> str:
         return f"surgisoft fit {{data}} --inputs pressure --effects {effects} -o NEW"
     if kind == "cannot_tell":
         return plan
-    if kind == "unknown_effect":  # when and where along the body it acts
-        return "surgisoft compare {model} {data}{before} --report PAGE"
+    if kind == "unknown_effect":
+        return WHERE_IT_ACTS
     return ""
 
 

@@ -27,6 +27,7 @@ from surgisoft.measurement.recordings import (
     with_predictions,
 )
 from surgisoft.measurement.recordings.file import SUFFIXES
+from surgisoft.measurement.units import PLURAL
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.callables.arm import arm_around, statements, validation_of
 from surgisoft.surrogate.callables.named import (
@@ -40,6 +41,7 @@ from surgisoft.surrogate.callables.predicted import PredictedNetwork, monomials,
 from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel, Validation
+from surgisoft.units import MM_PER
 
 FIT_ROWS = 4000
 """Rows that the polynomial is fitted to, evenly thinned."""
@@ -58,6 +60,17 @@ LEAST_REPRODUCED = 0.9
 """Least share of the predicted squared motion that the polynomial, with the features of the past,
 has to give back on held-out blocks for effects on the actuation to be judged: the share of the
 motion that such an effect changes is then known to about a third (the root of what is left)."""
+
+LENGTH_UNITS = tuple(
+    pair for unit in MM_PER if unit != "mm" for pair in ((unit, "mm"), ("mm", unit))
+)
+"""Wrong readings of a model's key points: the true unit, and the one that they were read as."""
+COLUMNS_BY_UNIT = "expected columns named by the unit of their values, such as k0_x_mm or k0_x_m"
+"""What to do about a file of predictions in another unit than its columns say."""
+SAME_LENGTH = 1.5
+"""Ratio up to which the body of a model and the measured one are equally long, once a wrong unit of
+length is corrected: an arm that stretches is longer than at rest. Its square is less than the
+smallest ratio of two factors that are tried (2.54), so that one factor at most is found."""
 
 Given = Iterable[Recording | str | Path] | Recording | str | Path
 """Recordings, their files, or folders of them."""
@@ -179,7 +192,11 @@ def callable_arm(
         )
     seen = [*recordings, *(before or [])]
     spec = replace(arm_spec(seen, known.pop("actuation", "measured")), idle=())
-    return _validated(arm_around(named, replace(spec, **known)), errors, before, named.name)
+    model = arm_around(named, replace(spec, **known))
+    at_rest = model.rest_mm.double().numpy()[None]
+    what, advice = f"{named.name}: returns key points", "expected mm: multiply them by {:.6g}"
+    _check_length_unit(what, advice, at_rest, seen, model.spec.length_mm)
+    return _validated(model, errors, before, named.name)
 
 
 def predicted_arm(
@@ -191,11 +208,75 @@ def predicted_arm(
     """The arm model that stands for predictions of recorded rows (`Recording.predicted_mm`)."""
     seen = [*recordings, *(before or [])]
     spec = replace(arm_spec(seen), idle=())
+    for recording in seen:
+        if recording.predicted_mm is not None:
+            what = f"{name}: the key points predicted for {recording.label} are"
+            points = recording.predicted_mm
+            _check_length_unit(what, COLUMNS_BY_UNIT, points, [recording], spec.length_mm)
     network = polynomial_of(seen, spec, name)
     rest = torch.tensor(spec.rest)
     points = network(rest[None], rest[None])[0]
     model = ArmModel(spec, network, None, points).eval().requires_grad_(False)
     return _validated(model, None if error_mm is None else (error_mm,), before, name)
+
+
+class BodyLengths(NamedTuple):
+    """How long a body is along its key points that a model and the recordings both have, mm."""
+
+    model_mm: float
+    """At rest, or as the median of predictions, by a model."""
+    measured_mm: float
+    """As the median of the recordings."""
+
+    def blame_model(self, length_mm: float) -> bool:
+        """Whether the measured body is nearer to the stated length than the model's."""
+        model, measured = (abs(np.log(each / length_mm)) for each in self)
+        return bool(measured < model)
+
+
+def body_lengths(points: np.ndarray, recordings: Sequence[Recording]) -> BodyLengths | None:
+    """Both lengths, from key points (T, n, 3) of a model; None where one is not known."""
+    if points.shape[1] != recordings[0].key_points:
+        return None
+    gaps = np.stack([_gaps_mm([points]), _gaps_mm([each.key_points_mm for each in recordings])])
+    found = BodyLengths(*gaps[:, np.isfinite(gaps).all(0)].sum(1).tolist())
+    return found if min(found) > 0 else None
+
+
+def _check_length_unit(
+    what: str,
+    advice: str,
+    points: np.ndarray,
+    recordings: Sequence[Recording],
+    length_mm: float | None,
+) -> None:
+    """Raise InputError where a model's key points (T, n, 3) are in another unit of length than mm.
+
+    They are where its body is longer or shorter than the measured one by the ratio of two units,
+    and the measured one is nearer to the stated length. Where that is not known, or there is one
+    key point, the unit of the recordings may be wrong as well: the set-up tests say so. what,
+    advice: begin and end of the message.
+    """
+    found = body_lengths(points, recordings)
+    if found is None or length_mm is None or not found.blame_model(length_mm):
+        return
+    for true, read in LENGTH_UNITS:
+        by = MM_PER[true] / MM_PER[read]
+        if abs(np.log(by * found.model_mm / found.measured_mm)) > np.log(SAME_LENGTH):
+            continue
+        wrong = f"in {PLURAL.get(true, true)}" if by > 1 else f"{1 / by:g} times too large"
+        raise InputError(
+            f"{what} {wrong}: along the body, base to tip, they are {found.model_mm:.3g} long, "
+            f"where {found.measured_mm:.3g} mm are measured and the arm is {length_mm:.4g} mm "
+            f"long; {advice.format(by)}"
+        )
+
+
+def _gaps_mm(points: Sequence[np.ndarray]) -> np.ndarray:
+    """(n - 1,) median distances between neighbours of key points (T, n, 3), mm; NaN if not seen."""
+    each = np.concatenate([np.linalg.norm(np.diff(part, axis=1), axis=2) for part in points])
+    seen = [gap[np.isfinite(gap)] for gap in each.T]
+    return np.array([np.median(gap) if len(gap) else np.nan for gap in seen])
 
 
 def _validated(
@@ -234,6 +315,11 @@ def has_slope(model: ArmModel) -> bool:
     """Whether it is known how a model's predictions change with the actuation."""
     network = model.network
     return not isinstance(network, PredictedNetwork) or network.reproduced >= LEAST_REPRODUCED
+
+
+def is_of_other_origin(model: ArmModel) -> bool:
+    """Whether a model is a callable or predictions, and no fitted network."""
+    return isinstance(model.network, CallableNetwork | PredictedNetwork)
 
 
 def notes_of(model: ArmModel) -> list[str]:

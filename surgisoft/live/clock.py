@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -16,6 +16,9 @@ SPIN_S = 5e-4
 """Last part of a wait that is spent looking at the clock instead of sleeping [s]."""
 MISSED = 1.5
 """An interval of more periods than this counts as an overrun where the rig keeps the time."""
+FASTER = 0.5
+"""Mean interval, in periods, below which a rig that keeps the time is one of another time than this
+computer's, as a simulation is: no overrun of it says anything."""
 NAMED = 5
 """Number of overruns whose time is printed."""
 
@@ -50,6 +53,13 @@ class Timing:
     memory or for the rig."""
     overruns_s: tuple[float, ...] = ()
     """When the overruns were, from the first period on [s]."""
+    interval_s: float = float("nan")
+    """Mean interval from sample to sample [s]; nan where nobody kept time."""
+
+    @property
+    def in_another_time(self) -> bool:
+        """Whether the rig keeps the time, and its samples come much faster than it states."""
+        return self.pace == "rig" and self.interval_s < FASTER * self.period_s
 
     @property
     def sentence(self) -> str:
@@ -60,6 +70,12 @@ class Timing:
         )
         if self.pace == "simulated":
             return f"{self.ticks:,} periods of {1e3 * self.period_s:g} ms, simulated clock; {work}"
+        if self.in_another_time:
+            return (
+                f"{self.ticks:,} periods of {1e3 * self.period_s:g} ms, which the rig passed in "
+                f"{1e3 * self.interval_s:.2f} ms each: it keeps a time of its own, as a simulation "
+                f"does (docs/rigs.md#a-simulation-of-your-own); {work}"
+            )
         return (
             f"{self.ticks:,} periods of {1e3 * self.period_s:g} ms; jitter "
             f"{1e3 * self.jitter_s:.3f} ms (99 %: {1e3 * self.interval_99_s:.3f} ms, worst "
@@ -153,7 +169,7 @@ class Clock:
         kept = self.pace != "simulated" and len(self._intervals) > 0
         off = np.abs(np.array(self._intervals) - self.period_s) if kept else np.full(1, np.nan)
         busy = np.array(self._busy) if self._busy else np.full(1, np.nan)
-        return Timing(
+        found = Timing(
             self.pace,
             self.period_s,
             len(self._busy),
@@ -166,4 +182,8 @@ class Clock:
             self.overruns,
             self._waiting,
             tuple(self._overruns_s),
+            float(np.mean(self._intervals)) if kept else float("nan"),
         )
+        if found.in_another_time:
+            return replace(found, overruns=0, overruns_waiting=0, overruns_s=())
+        return found

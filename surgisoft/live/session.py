@@ -365,7 +365,9 @@ class _Session:
                 pace = "real" if request.clock == "real" else "simulated"
             elif request.clock == "simulated":
                 raise InputError(
-                    f"--clock simulated: '{request.rig}' is not a simulated rig; leave it out"
+                    f"--clock simulated: '{request.rig}' is not a simulated rig, which has the "
+                    "method 'read_beside_truth' (docs/rigs.md#a-simulation-of-your-own); leave "
+                    "--clock out"
                 )
             clock = Clock(rig.period_s, pace)
             note = f"run {Path(request.policy).name}"

@@ -3,7 +3,8 @@
 A rig is opened by a callable whose keyword parameters are its options: a class, a dataclass or a
 function, with an annotation of `str`, `int`, `float`, `bool`, `Path`, or a tuple of one of them,
 for each parameter. The package's rigs are in `RIGS`. Another package offers one in the entry point
-group `surgisoft.rigs`; any other callable is named as `package.module:object`.
+group `surgisoft.rigs`; any other callable is named as `package.module:object` or
+`FILE.py:object`.
 """
 
 import functools
@@ -23,6 +24,8 @@ from types import ModuleType
 from typing import Annotated, Any, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.files import resolved
+from surgisoft.python_files import run_file
 from surgisoft.rig.drivers.serial_rig import SerialRig
 from surgisoft.rig.hidden import HIDDEN
 from surgisoft.rig.interface import Rig, is_simulated
@@ -175,7 +178,7 @@ class RigText:
     """Rig and options of a text `NAME[:option=value,...]`."""
 
     name: str
-    """Name of a rig, or `package.module:object`."""
+    """Name of a rig, `package.module:object` or `FILE.py:object`."""
     options: Mapping[str, str]
     """Option -> value as it was written."""
 
@@ -212,7 +215,8 @@ def rig_names() -> list[str]:
 
 
 def parse_rig(text: str) -> RigText:
-    """Name and options of `NAME[:option=value,...]` or `package.module:object[:...]`."""
+    """Name and options of `NAME[:option=value,...]`, `package.module:object[:...]` or
+    `FILE.py:object[:...]`."""
     name, colon, rest = text.strip().partition(":")
     if rest and "=" not in rest.partition(":")[0] and name not in rig_names():
         attribute, more, rest = rest.partition(":")
@@ -226,10 +230,10 @@ def parse_rig(text: str) -> RigText:
         if option in options:
             raise InputError(f"rig '{text}': option '{option}' is given twice")
         options[option] = value.strip()
-    if not re.fullmatch(r"[\w.-]+(:[\w.]+)?", name):
+    if not re.fullmatch(r"[\w.-]+(:[\w.]+)?|.+\.py:[\w.]+", name):
         raise InputError(
-            f"rig '{text}': expected NAME[:option=value,...] or package.module:object; "
-            f"known names are {', '.join(rig_names())}"
+            f"rig '{text}': expected NAME[:option=value,...], package.module:object or "
+            f"FILE.py:object; known names are {', '.join(rig_names())}"
         )
     return RigText(name, options)
 
@@ -241,6 +245,8 @@ def rig_factory(name: str) -> Callable[..., Rig]:
     if ":" in name:
         return _checked_factory(name, _object(name))
     offered = _offered()
+    if name.endswith(".py"):
+        raise InputError(f"rig '{name}': expected FILE.py:object, such as {name}:Bench")
     if name not in offered:
         raise unknown_name("rig", name, rig_names())
     entry = offered[name]
@@ -321,7 +327,8 @@ def known_size(text: str, defaults: Mapping[str, Any] | None = None) -> tuple[in
 
 
 def open_rig(text: str, defaults: Mapping[str, Any] | None = None, **fields: Any) -> Rig:
-    """Open the rig that `NAME[:option=value,...]` or `package.module:object[:...]` names.
+    """Open the rig that `NAME[:option=value,...]` or `package.module:object[:...]` names, or
+    `FILE.py:object[:...]`.
 
     A real rig comes inside `SafeRig`, whose limits (`Safety`) are options of every real rig. Use it
     in a block `with guarded(rig)` (`surgisoft.rig.safety`), which vents it at the end.
@@ -383,23 +390,41 @@ def _entries(path: tuple[str, ...]) -> dict[str, EntryPoint]:
 
 
 def _object(name: str) -> Any:
-    """The object `package.module:object`; modules of the working folder count, too."""
-    module_name, _, path = name.partition(":")
+    """The object `package.module:object`, where modules of the working folder count, too, or
+    `FILE.py:object`."""
+    module_name, _, path = name.rpartition(":")
+    in_file = module_name.endswith(".py")
+    if in_file and not Path(module_name).is_file():
+        raise InputError(f"rig '{name}': no file {module_name}; expected FILE.py:object")
     here = os.getcwd()
     if here not in sys.path and "" not in sys.path:
         sys.path.append(here)
     try:
-        found: Any = importlib.import_module(module_name)
+        found: Any = _of_file(module_name) if in_file else importlib.import_module(module_name)
     except Exception as error:
         raise InputError(
-            f"rig '{name}': module '{module_name}' does not load "
-            f"({type(error).__name__}: {error}); expected package.module:object"
+            f"rig '{name}': {'file' if in_file else 'module'} '{module_name}' does not load "
+            f"({type(error).__name__}: {error}); expected package.module:object or FILE.py:object"
         ) from error
     for part in path.split("."):
         if not hasattr(found, part):
             raise InputError(f"rig '{name}': '{module_name}' has no '{path}'; correct the name")
         found = getattr(found, part)
     return found
+
+
+FILES: dict[Path, tuple[bytes, ModuleType]] = {}
+"""Content and module of each Python file that was named as a rig."""
+
+
+def _of_file(name: str) -> ModuleType:
+    """The module of a Python file, which is run once and again where its content has changed."""
+    path = Path(name)
+    place, content = resolved(path), path.read_bytes()
+    known = FILES.get(place)
+    if known is None or known[0] != content:
+        FILES[place] = content, run_file(path, content, "surgisoft_rig")
+    return FILES[place][1]
 
 
 def _checked_factory(name: str, found: Any) -> Callable[..., Rig]:

@@ -10,8 +10,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rich.text import Text
 
-from surgisoft.cli import MANY, run, spread
+from surgisoft.cli import MANY, command_line, run, spread
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import load_recording
 
@@ -174,7 +175,6 @@ def test_options_of_many_values_are_spread():
 
 def _options():
     """(command, option) of every command but the long studies."""
-    from surgisoft.cli import command_line
 
     def walk(path, command):
         if hasattr(command, "commands"):
@@ -186,6 +186,15 @@ def _options():
                     yield " ".join(path), option
 
     return [pair for pair in walk((), command_line()) if not pair[0].startswith("benchmark")]
+
+
+def _helps(path, command):
+    """(words, help text) of a command, its arguments and options, and every command in it."""
+    yield " ".join(path), command.help or ""
+    for each in command.params:
+        yield " ".join((*path, each.name)), getattr(each, "help", None) or ""
+    for name, inner in getattr(command, "commands", {}).items():
+        yield from _helps((*path, name), inner)
 
 
 def test_one_name_means_one_thing_in_every_command():
@@ -220,6 +229,13 @@ def test_every_option_of_many_values_shows_it_in_the_help():
     assert {name for _, option in several for name in option.opts} == MANY
     for command, option in several:
         assert option.metavar.endswith("..."), f"{option.opts} of {command}"
+
+
+def test_no_part_of_a_help_text_is_taken_for_markup():
+    """Of `[measured]` nothing would be printed."""
+    texts = dict(_helps((), command_line()))
+    assert "delay_s" in texts["import delay_s"]
+    assert {name: Text.from_markup(text).plain for name, text in texts.items()} == texts
 
 
 def test_python_runs_the_package_as_the_command(capsys):

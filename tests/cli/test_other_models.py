@@ -330,7 +330,7 @@ def test_after_a_correction_predictions_keep_their_order(capsys, monkeypatch, tm
     two = [replace(recording, name=name) for name in ("second", "first")]
     setup = SimpleNamespace(
         correctable=True, recordings=["second", "first"], instructions="turn it",
-        alternative_instructions=(), how_to_tell="", corrected=lambda _: two,
+        alternative_instructions=(), how_to_tell="", of_model="", corrected=lambda _: two,
     )  # fmt: skip
     found = diagnosis(setup=setup)
     monkeypatch.setattr("surgisoft.diagnosis.diagnose.diagnose", lambda *_, **__: found)

@@ -156,7 +156,8 @@ def found_setup(**fields) -> SimpleNamespace:
     values = {
         "correctable": False, "recordings": ("bench",),
         "instructions": "turn the tracker\nby a quarter",
-        "alternative_instructions": (), "how_to_tell": "", "corrected": lambda some: some,
+        "alternative_instructions": (), "how_to_tell": "", "of_model": "",
+        "corrected": lambda some: some,
     }  # fmt: skip
     return SimpleNamespace(**(values | fields))
 
@@ -193,6 +194,9 @@ def test_diagnose_prints_what_mends_a_set_up(bench, tmp_path, capsys, monkeypatc
     out = printed(capsys, monkeypatch, target, found, *command)
     assert "to correct it (--apply does it), as lines of a map that reads the recording, n" in out
     assert out.endswith(f"next: surgisoft diagnose default {rec} --apply CORRECTED\n")
+    either = diagnosis(setup=found_setup(correctable=True, of_model="the model returns m"))
+    out = printed(capsys, monkeypatch, target, either, *command)
+    assert out.splitlines()[-1].startswith("next, if the recordings are wrong: surgisoft diagnose")
     out = printed(capsys, monkeypatch, target, found, *command, "--apply", str(new))
     assert out.endswith(f"next: surgisoft diagnose default {new}\n")
     assert [path.name for path in new.glob("*.parquet")] == ["bench.parquet"]

@@ -313,7 +313,7 @@ def test_a_fall_that_chance_or_the_fit_explains_is_not_claimed():
     assert replace(fall, p_value=0.04).claimed
     chance = replace(fall, p_value=0.06)
     assert not chance.significant
-    assert "may be the network's own error, which the effect resembles (p 0.06)" in chance.sentence
+    assert "may be the model's own error, which the effect resembles (p 0.06)" in chance.sentence
     seen = replace(fall, in_fit=0.3)
     assert seen.significant
     assert not seen.claimed

@@ -217,7 +217,11 @@ def test_what_is_weak_about_the_data_is_told(found):
     problem = problem_of(model, [recording]).with_reference(load_training_residuals("default"))
     assert data_quality_warnings(problem) == []
     away = replace(problem, pressure=np.full_like(problem.pressure, 3.0))
-    assert "far from those" in data_quality_warnings(away)[0]
+    assert "far from those that the model was fitted on" in data_quality_warnings(away)[0]
+    fit_unknown = model.replace()
+    fit_unknown.training_residuals = None
+    before = replace(away, model=fit_unknown)
+    assert "far from those of the recordings from before" in data_quality_warnings(before)[0]
     twice = problem.with_reference([recording, recording])  # the same actuation, distance 0
     assert data_quality_warnings(twice) == []
     loud = replace(problem.table, noise_mm=problem.noise_mm + 9.0, floor=Floor(9.0, "holds"))

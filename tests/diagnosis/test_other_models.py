@@ -202,3 +202,61 @@ def test_files_that_do_not_fit_are_one_line(loaded, with_file, tmp_path):
         assert str(file) in str(refused.value)
     with pytest.raises(InputError, match="1 files of predictions for 2 recordings"):
         open_model("arm", [loaded, replace(loaded, name="b")], None, [tmp_path / "few.csv"])
+
+
+def scaled(by):
+    """The default arm as a callable whose key points are multiplied."""
+    return lambda time_s, actuation: by * whole_runs(time_s, actuation)
+
+
+def with_length(recording, length_mm):
+    return replace(recording, arm=replace(recording.arm, length_mm=length_mm))
+
+
+@pytest.mark.parametrize(
+    ("by", "wrong", "times"),
+    [
+        (1e-3, "in m", "1000"),
+        (0.1, "in cm", "10"),
+        (1 / 25.4, "in inches", "25.4"),
+        (1e3, "1000 times too large", "0.001"),
+    ],
+)
+def test_a_callable_in_another_unit_of_length_is_refused(loaded, by, wrong, times):
+    said = f"returns key points {wrong}: .*multiply them by {times}$"
+    with pytest.raises(InputError, match=said):
+        callable_arm(given_callable(scaled(by)), [loaded])
+
+
+@pytest.mark.parametrize(("by", "wrong"), [(1e-3, "in m"), (1e3, "1000 times too large")])
+def test_predictions_in_another_unit_of_length_are_refused(loaded, with_file, by, wrong):
+    given = replace(with_file, predicted_mm=by * with_file.predicted_mm)
+    with pytest.raises(InputError, match=f"predicted for .* are {wrong}: .*k0_x_mm or k0_x_m$"):
+        predicted_arm("arm", [given])
+
+
+@pytest.mark.parametrize("by", [0.5, 0.75, 1.5, 2.0, 100.0])
+def test_a_model_of_another_size_is_not_refused(loaded, by):
+    """A poor model, or one off by a factor that is no unit."""
+    callable_arm(given_callable(scaled(by)), [loaded])
+
+
+def test_the_stated_length_tells_whose_unit_is_wrong(loaded):
+    """The recording is in cm or m, or no length is stated: the set-up tests look at it."""
+    for by in (0.1, 1e-3):
+        wrong = replace(loaded, key_points_mm=by * loaded.key_points_mm)
+        callable_arm(given_callable(whole_runs), [wrong])
+    callable_arm(given_callable(scaled(1e-3)), [with_length(loaded, None)])
+
+
+def test_the_set_up_tests_leave_open_whose_unit_is_wrong_only_where_no_length_tells(loaded):
+    """The recording is in cm; without a length the model may be ten times too large."""
+    right = callable_arm(given_callable(whole_runs), [loaded])
+    in_cm = replace(loaded, key_points_mm=loaded.key_points_mm / 10)
+    told = find_setup_faults(right, [in_cm])
+    assert told.kinds == ("length_unit",)
+    assert told.of_model == ""
+    unknown = right.replace(spec=replace(right.spec, length_mm=None)).eval()
+    either = find_setup_faults(unknown, [in_cm])
+    assert either.of_model == "the positions of the model are 10 times too large"
+    assert either.sentence.startswith(f"{told.sentence.partition(':')[0]}; or {either.of_model}:")

@@ -31,6 +31,7 @@ from surgisoft.diagnosis.diagnose import (
     next_command,
     periodic,
     sentence_of,
+    since,
     smooth_error,
     with_refit,
 )
@@ -131,7 +132,7 @@ def test_a_fall_is_claimed_where_it_is_certain_large_and_due_to_the_effects():
     assert fall(fall=1e-4, ci95=(1e-5, 2e-4)).sentence.endswith("is too small")
     assert not fall(p_value=0.9).claimed
     assert (
-        "may be the network's own error, which the effect resembles (p 0.9)"
+        "may be the model's own error, which the effect resembles (p 0.9)"
         in fall(p_value=0.9).sentence
     )
     changed = amendment(change=CHANGE, model_error=fall(2.0, 1.5), retuned=True)
@@ -211,6 +212,54 @@ def decision(kind, *effects, reason=None, chances=CHANCES, statements=()) -> Dec
 def test_each_kind_of_result_has_its_sentence_and_its_next_command(given, sentence, command):
     assert sentence in sentence_of(given, LEVELS, [0.15])
     assert next_command(given) == command
+
+
+PAGE = "surgisoft compare {model} {data}{before} --report PAGE"
+
+
+@pytest.mark.parametrize(
+    ("reason", "static", "said"),
+    [
+        (None, False, "most probably it is the model's own: its parameters or its form are off;"),
+        ("network", False, "the model does not describe this arm: correct its parameters, its fr"),
+        ("network", True, "explains most of the error, which is 1.25 times the model's validated"),
+        ("learned", False, "so the parameters of the model may make up for a part of the missin"),
+    ],
+)
+def test_a_model_of_other_origin_is_not_to_be_replaced_by_a_network(reason, static, said):
+    given = decision("surrogate_undertrained", reason=reason)
+    text = sentence_of(given, LEVELS, [0.15], static=static, fitted=False)
+    assert said in text
+    assert "network" not in text
+    assert "fit " not in text
+    assert next_command(given, trainable=False, fitted=False) == PAGE
+
+
+@pytest.mark.parametrize(
+    ("of", "command"),
+    [
+        ("called", "surgisoft improve M B.parquet -o NEW"),
+        ("fitted", "surgisoft fit B.parquet -o NEW"),
+    ],
+)
+def test_a_change_within_the_error_of_the_model_asks_for_less_of_it_before(of, command):
+    """Recordings after the change would teach the model the change."""
+    given = decision("surrogate_undertrained")
+    verdict = Verdict(given.kind, (), sentence_of(given, LEVELS, [0.15]))
+    found = Diagnosis(verdict, LEVELS, (), next_command=next_command(given))
+    both = SimpleNamespace(names="B", used=False, change=SimpleNamespace(sentence="not paired"))
+    model = still_model()
+    if of == "called":
+        model = callable_arm(given_callable(bend), [recording(np.zeros(400), walk(400, 2))])
+    told = since(found, both, SimpleNamespace(problem=SimpleNamespace(model=model)))
+    assert told.command("M", "A.parquet", "B.parquet --paired never", "B.parquet") == command
+
+
+def bend(time_s, actuation):
+    """Key points (T, 2, 3), mm: the tip moves by a millimetre per kPa of the first chamber."""
+    points = np.zeros((len(actuation), 2, 3))
+    points[:, 1] = np.stack([actuation[:, 0], 0 * time_s, 100 + 0 * time_s], axis=1)
+    return points
 
 
 def test_a_model_that_cannot_be_trained_on_is_fitted_anew_where_it_has_learned_an_effect():

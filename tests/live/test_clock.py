@@ -68,6 +68,17 @@ def test_a_late_sample_of_a_rig_is_an_overrun():
     assert timing.overruns == 1
 
 
+def test_a_rig_that_keeps_another_time_has_no_overruns():
+    """A simulation that is not declared as one; samples in bursts keep the period on average."""
+    fast, _ = loop("rig", [0.002, 0.002, 0.09, 0.002] * 10, period_s=0.05)
+    assert fast.overruns == 0
+    assert "which the rig passed in 24.00 ms each" in fast.sentence
+    assert "overruns" not in fast.sentence
+    bursts, _ = loop("rig", [0.001, 0.001, 0.148] * 10, period_s=0.05)
+    assert bursts.overruns == 10
+    assert "10 overruns" in bursts.sentence
+
+
 def test_an_overrun_names_its_time_and_whether_the_loop_computed_or_waited():
     work = [0.01, 0.01, 0.07, 0.01, 0.01]
     own, _ = loop("real", work)

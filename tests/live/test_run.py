@@ -444,7 +444,7 @@ def test_bad_input_is_one_line_and_nothing_is_written(
     ("given", "message"),
     [
         ({"clock": "fast"}, "unknown clock 'fast'"),
-        ({"rig": Real, "clock": "simulated"}, "is not a simulated rig; leave it out"),
+        ({"rig": Real, "clock": "simulated"}, "is not a simulated rig, which has the method"),
         (
             {"policy": "scripted", "task": "track_circle", "model": default_arm()},
             "a policy takes its arm model from a folder; save the model",

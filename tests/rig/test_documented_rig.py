@@ -8,6 +8,8 @@ import numpy as np
 
 from surgisoft.cli import run
 from surgisoft.measurement.recordings import load_recording
+from surgisoft.rig import open_rig
+from surgisoft.rig.interface import is_simulated
 
 DEVICES = """
 import time
@@ -23,6 +25,24 @@ def wait_for_picture(seconds):
     x, y = set_points[-1]
     return np.array([[0, 0, 0], [x / 4, y / 4, 45], [x, y, 90.0]])
 """
+
+
+def test_the_simulator_of_the_documentation_is_a_simulated_rig(tmp_path):
+    """Behind a step of 10 ml its volume is 10 (1 - e^(-t / 0.2 s)), and its tip 3 mm per ml."""
+    text = Path("docs/rigs.md").read_text()
+    (source,) = re.findall(r"```python\n(\"\"\"A simulated arm of our own.*?)```", text, re.DOTALL)
+    (tmp_path / "our_arm.py").write_text(source)
+    rig = open_rig(f"{tmp_path / 'our_arm.py'}:Simulator:noise_mm=0.02")
+    assert is_simulated(rig)
+    rig.reset()
+    rig.command(np.array([10.0, 0.0]))
+    found = [rig.read_beside_truth() for _ in range(40)]
+    volume = 10 * (1 - np.exp(-0.05 * np.arange(1, 41) / 0.2))
+    tip = np.array([truth.centres_mm[0, -1, 0] for _, truth in found])
+    np.testing.assert_allclose([sample.measured[0] for sample, _ in found], volume, atol=1e-9)
+    np.testing.assert_allclose(tip, 3 * volume, atol=1e-9)
+    seen = np.array([sample.key_points_mm[-1, 0] for sample, _ in found])
+    assert 0.01 < np.std(seen - tip) < 0.04
 
 
 def test_the_rig_of_the_documentation_runs(tmp_path, monkeypatch):

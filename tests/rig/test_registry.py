@@ -13,7 +13,15 @@ from surgisoft.measurement.protocols import load_schedule
 from surgisoft.measurement.recordings import load_recording
 from surgisoft.rig import SafeRig, VirtualRig, open_rig
 from surgisoft.rig.interface import close, is_simulated, vent
-from surgisoft.rig.registry import RIGS, SIMULATED, parse_rig, rig_names, rig_options
+from surgisoft.rig.registry import (
+    RIGS,
+    SIMULATED,
+    RigText,
+    check_rig,
+    parse_rig,
+    rig_names,
+    rig_options,
+)
 from tests.rig.own_rig import OwnRig
 
 OWN = "tests.rig.own_rig:OwnRig"
@@ -170,6 +178,53 @@ def test_collect_drives_a_users_rig_and_refuses_what_it_has_no_option_for(tmp_pa
     assert recording.commanded.max() <= 40.0
     same = surgisoft.collect("walk", f"{OWN}:port=x", points=24)
     np.testing.assert_array_equal(same.measured, recording.measured)
+
+
+BENCH = """
+from bench_part import STEP
+from tests.rig.own_rig import OwnRig
+
+class Bench(OwnRig):
+    def __init__(self, robot: int = STEP):
+        super().__init__("x", robot)
+"""
+
+
+def test_a_rig_is_named_by_its_file_as_a_model_is(tmp_path, monkeypatch, capsys):
+    """The file's own folder counts for its imports; changed content is read again."""
+    (tmp_path / "lab").mkdir()
+    (tmp_path / "lab" / "bench_part.py").write_text("STEP = 4")
+    file = tmp_path / "lab" / "bench.py"
+    file.write_text(BENCH)
+    name = f"{file}:Bench"
+    assert parse_rig(f"{name}:robot=2") == RigText(name, {"robot": "2"})
+    assert rig_options(name)["robot"].default == 4
+    file.write_text(BENCH.replace("= STEP", "= 5"))
+    assert rig_options(name)["robot"].default == 5
+    of_file = surgisoft.collect("walk", f"{name}:robot=0", points=24)
+    of_module = surgisoft.collect("walk", f"{OWN}:port=x", points=24)
+    np.testing.assert_array_equal(of_file.measured, of_module.measured)
+    monkeypatch.chdir(tmp_path / "lab")
+    assert run(["rig", "list", "bench.py:Bench"]) == 0
+    assert capsys.readouterr().out.startswith("bench.py:Bench: ")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("bench.py", "expected FILE.py:object, such as bench.py:Bench"),
+        ("bench.py:seed=3", "expected FILE.py:object, such as bench.py:Bench"),
+        ("away.py:Bench", "no file away.py; expected FILE.py:object"),
+        ("bench.py:Bank", "'bench.py' has no 'Bank'; correct the name"),
+        ("broken.py:Bench", r"file 'broken.py' does not load \(ZeroDivisionError: "),
+    ],
+)
+def test_a_file_that_holds_no_rig_is_one_line(text, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("bench.py").write_text("class Bench: pass")
+    Path("broken.py").write_text("1 / 0")
+    with pytest.raises(InputError, match=message):
+        check_rig(text)
 
 
 def test_venting_uses_what_the_rig_has():

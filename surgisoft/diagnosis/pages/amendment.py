@@ -408,7 +408,9 @@ def what_is_left(result: Improvement, command: str = "") -> Section:
         pairs = ", ".join(" from ".join(pair) for pair in plan.separates) or "none for certain"
         text = f"Record next: {plan.name}, {plan.minutes:g} minutes; it distinguishes {pairs}."
         parts.append(Text(text))
-    if last.next_command and not (result.steps and "amend" in last.next_command):
+    # What was added since BEFORE is no part of a model that is to describe BEFORE better.
+    done = result.steps and any(word in last.next_command for word in ("amend", "{earlier}"))
+    if last.next_command and not done:
         parts.append(Command(command or last.command("NEW", "REC")))
     if last.not_testable:
         rows = [(each.effect, each.reason) for each in last.not_testable]

@@ -276,7 +276,7 @@ def _probabilities(chances: Probabilities) -> Section:
     """What may be true, with the calibrated probabilities."""
     rows = [
         ("nothing is missing", f"{chances.nothing:.2f}"),
-        ("only the network needs a better fit", f"{chances.network:.2f}"),
+        ("only the model itself is off", f"{chances.network:.2f}"),
         ("a known effect is missing", f"{chances.known:.2f}"),
         ("an unknown effect is missing", f"{chances.unknown:.2f}"),
     ]

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from surgisoft.diagnosis.other_models import has_slope
+from surgisoft.diagnosis.other_models import body_lengths, has_slope, is_of_other_origin
 from surgisoft.diagnosis.residuals import (
     EVERY_ROW,
     fit_of_model,
@@ -34,6 +34,7 @@ from surgisoft.diagnosis.setup.words import (
     faults_of,
     frame_fault,
     joined,
+    model_in_other_unit,
     signed_axes,
     time_unit_fault,
 )
@@ -94,6 +95,8 @@ class SetupResult:
     """Whether the recordings can be corrected without recording again."""
     correction: Correction
     """The correction of a recording."""
+    of_model: str = ""
+    """How the model may be wrong in place of the recordings; empty where it is not."""
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -120,6 +123,7 @@ class SetupResult:
             "instructions": self.instructions,
             "alternative_instructions": list(self.alternative_instructions),
             "how_to_tell": self.how_to_tell,
+            "of_model": self.of_model,
             "before_mm": self.before_mm,
             "after_mm": self.after_mm,
             "floor_mm": self.floor_mm,
@@ -287,7 +291,10 @@ class _Report:
         others = [(o, self._exact(o)) for o in (self.found.as_good if self.found else ())]
         alternatives = tuple((*other_time, *self._faults(o, f)) for o, f in others)
         instructions, correctable = self._instructions(correction)
-        text = "; or ".join(joined(some) for some in (faults, *alternatives))
+        of_model = self._length_of_model(given)
+        how_to_tell = _how_to_tell(faults, (*alternatives, *of_model))
+        text = "; or ".join((*(joined(some) for some in (faults, *alternatives)), *of_model))
+        floor_mm = self.search.levels.told_noise
         silent_model = other_time and len(faults) == 1 and before <= PROOF.as_good * after
         if silent_model:
             text += f": the error is {before:.3g} mm as read and {after:.3g} mm with the correction"
@@ -300,6 +307,8 @@ class _Report:
                 for fit, level in zip(whole_model, (before, after), strict=True)
             )
             text += f": the correction reduces the error from {before:.3g} to {after:.3g} mm"
+            if given.mm_per_unit != 1.0:
+                floor_mm = floor_to_tell(*noise_of(right))
         return SetupResult(
             faults=tuple(faults),
             alternatives=alternatives,
@@ -308,13 +317,14 @@ class _Report:
             alternative_instructions=tuple(
                 self._correction(o.hypothesis, f).lines(self._commands) for o, f in others
             ),
-            how_to_tell=SLOW_OR_WRONG if silent_model else _how_to_tell(faults, alternatives),
+            how_to_tell=SLOW_OR_WRONG if silent_model else how_to_tell,
             before_mm=before,
             after_mm=after,
-            floor_mm=self.search.levels.told_noise,
+            floor_mm=floor_mm,
             recordings=tuple(recording.name for recording in self.recordings),
             correctable=correctable,
             correction=correction,
+            of_model="; or ".join(of_model),
         )
 
     @property
@@ -334,6 +344,20 @@ class _Report:
 
     def _faults(self, given: Fitted, frame: Frame) -> list[SetupFault]:
         return faults_of(given, frame, self._unit, self._mistake(given.hypothesis))
+
+    def _length_of_model(self, given: Hypothesis) -> tuple[str, ...]:
+        """That the model may be in another unit of length, and not the recordings.
+
+        Only of a callable or predictions, and not where the stated length tells that the unit of
+        the recordings is wrong.
+        """
+        spec, unit = self.model.spec, given.mm_per_unit
+        if unit == 1.0 or not is_of_other_origin(self.model):
+            return ()
+        lengths = body_lengths(self.model.rest_mm.double().numpy()[None], self.recordings)
+        if lengths and spec.length_mm and not lengths.blame_model(spec.length_mm):
+            return ()
+        return (model_in_other_unit(1 / unit),)
 
     def _time_unit(self) -> list[SetupFault]:
         """The fault that times are in another unit, where that is so."""
@@ -446,9 +470,13 @@ TESTS = {
 """What to do on the bench to find out whether a fault of each kind is there."""
 
 
-def _how_to_tell(faults: Sequence[SetupFault], alternatives) -> str:
-    """What to do on the bench to tell explanations apart."""
+def _how_to_tell(faults: Sequence[SetupFault], alternatives: Sequence) -> str:
+    """What to do on the bench to tell explanations apart.
+
+    alternatives: the faults of each other explanation, or its words where the model is wrong.
+    """
     if not alternatives:
         return ""
-    kinds = {fault.kind for some in (faults, *alternatives) for fault in some}
+    of_setup = [some for some in (faults, *alternatives) if not isinstance(some, str)]
+    kinds = {fault.kind for some in of_setup for fault in some}
     return "to distinguish them: " + "; or ".join(TESTS[kind] for kind in TESTS if kind in kinds)

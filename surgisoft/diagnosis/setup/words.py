@@ -1,6 +1,7 @@
 """Set-up faults in words, with their numbers."""
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -11,6 +12,7 @@ from surgisoft.diagnosis.setup.alignment import Frame, angle
 from surgisoft.diagnosis.setup.sample import Arrangement
 from surgisoft.diagnosis.setup.search import LENGTH_MISTAKES, Fitted, Kind
 from surgisoft.measurement.units import PLURAL
+from surgisoft.units import MM_PER
 
 NEAR_AXIS_RAD = 0.1
 """An axis of rotation is named x, y or z up to this angle, rad."""
@@ -136,12 +138,25 @@ def _length(mm: float) -> SetupFault:
     return SetupFault("length_unit", text, {"mm_per_recorded_mm": mm})
 
 
+def model_in_other_unit(factor: float) -> str:
+    """That a model may return another unit of length; factor: mm in what it calls one."""
+    unit = next((name for name, mm in MM_PER.items() if math.isclose(mm, factor)), None)
+    if unit is not None:
+        return f"the model returns {PLURAL.get(unit, unit)} where mm are expected"
+    return f"the positions of the model are {_times(factor)}"
+
+
+def _times(factor: float) -> str:
+    """How much too large or too small values are that have to be multiplied by a factor."""
+    return f"{1 / factor:.6g} times too large" if factor < 1.0 else f"{factor:.6g} times too small"
+
+
 def _unit(what: str, factor: float, mistake: tuple[str, str] | None, unit: str, are: str) -> str:
     """A wrong unit in words; unit: the stated one; factor: of it in what the recording calls one.
 
     mistake: the true unit, and the one that the values were read as.
     """
-    wrong = f"{1 / factor:.6g} times too large" if factor < 1.0 else f"{factor:.6g} times too small"
+    wrong = _times(factor)
     if mistake is None:
         return f"{what} {wrong}"
     true, read = (PLURAL.get(each, each) for each in mistake)

@@ -8,7 +8,6 @@ refused until the user has named it, too.
 import functools
 import hashlib
 import importlib
-import importlib.util
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ import numpy as np
 
 from surgisoft.errors import SHOWN, InputError, raised_by
 from surgisoft.files import resolved
+from surgisoft.python_files import run_file
 
 GROUP = "surgisoft.models"
 """Entry point group of callable models in installed packages."""
@@ -105,7 +105,8 @@ def named_callable(name: str) -> Named:
         sha256 = hashlib.sha256(content).hexdigest()
         if known is not None and (known.file, known.sha256) == (file, sha256):
             return known
-        value = _attribute(name, _guarded(name, lambda: _run_file(path, content)), attribute)
+        module = _guarded(name, lambda: run_file(path, content, "surgisoft_model"))
+        value = _attribute(name, module, attribute)
     else:
         here = str(Path.cwd())
         if here not in sys.path:
@@ -267,24 +268,6 @@ def _attribute(name: str, module: ModuleType, attribute: str) -> Any:
             raise InputError(f"{name}: imported, but there is no '{attribute}'; correct the name")
         value = getattr(value, part)
     return value
-
-
-def _run_file(path: Path, content: bytes) -> ModuleType:
-    module_name = f"surgisoft_model_{path.stem}"
-    spec = importlib.util.spec_from_file_location(module_name, path)
-    if spec is None:
-        raise ImportError("not a Python file")
-    module = importlib.util.module_from_spec(spec)
-    folder = str(resolved(path).parent)
-    if folder not in sys.path:
-        sys.path.append(folder)
-    sys.modules[module_name] = module
-    try:
-        exec(compile(content, str(path), "exec"), module.__dict__)
-    except BaseException:
-        del sys.modules[module_name]
-        raise
-    return module
 
 
 def _guarded(name: str, load: Any) -> Any:

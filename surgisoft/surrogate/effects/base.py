@@ -9,6 +9,7 @@ zero, and nonlinear parameters: time constants, widths, places. How identificati
 is its `Hypothesis` (`surgisoft.surrogate.effects.hypothesis`).
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from surgisoft.errors import InputError
-from surgisoft.surrogate.effects.readings import Reading
+from surgisoft.surrogate.effects.readings import Reading, each_axis, each_chamber
 
 Stage = Literal["line", "material", "body", "sensor"]
 STAGES: tuple[Stage, ...] = ("line", "material", "body", "sensor")
@@ -248,13 +249,29 @@ class Effect(nn.Module, ABC):
         """What the parameters mean, in words; as many readings whatever the parameters are.
 
         seconds: time that recordings cover, s; None where it is not known. By default every
-        quantity that is a single number.
+        quantity that is a single number, and every list of one number for each chamber (in front
+        of the network) or each axis of the base frame (behind it).
         """
-        return [
-            Reading(f"{_without_unit(each)} {{}}", float(each.value), each.unit)
-            for each in self.quantities()
-            if not isinstance(each.value, list | tuple)
-        ]
+        return [reading for each in self.quantities() for reading in self._readings_of(each)]
+
+    def _readings_of(self, quantity: Quantity) -> list[Reading]:
+        """The readings of one quantity; none of an array of another shape."""
+        name, value = _without_unit(quantity), quantity.value
+        if not isinstance(value, list | tuple):
+            return [Reading(f"{name} {{}}", float(value), quantity.unit)]
+        in_front = self.stage in FRONT
+        if len(value) != (len(self.origin) if in_front else 3) or any(
+            isinstance(each, list | tuple) for each in value
+        ):
+            return []
+        values = [float(each) for each in value]
+        largest = max(abs(quantity.low), abs(quantity.high))
+        sizes = [each / largest for each in values] if 0 < largest < math.inf else values
+        if in_front:
+            return each_chamber(
+                f"{name} of chamber {{chamber}} {{+}}", values, quantity.unit, sizes
+            )
+        return each_axis(f"{name} along {{axis}} {{+}}", values, quantity.unit, sizes)
 
     def implausible(self) -> list[Quantity]:
         """The parameters outside their plausible range."""

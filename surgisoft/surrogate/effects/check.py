@@ -20,6 +20,8 @@ STEP_S = 0.1
 """Time between these rows, s."""
 BEND_MM = 5.0
 """Displacement of the tip in these rows, mm."""
+TRIED_AMPLITUDE = 0.1
+"""Amplitude with which the change of the signal is compared with its derivative, in its unit."""
 UNCHANGED = 1e-5
 """Largest change of the signal at zero amplitude, as a share of its largest value."""
 
@@ -53,6 +55,15 @@ def _body(facts: ArmFacts) -> Tensor:
     share = torch.linspace(0.0, 1.0, len(facts.rest_mm))[:, None].square()
     aside = torch.linspace(-BEND_MM, BEND_MM, ROWS)[:, None, None]
     return facts.rest_mm + aside * share * torch.tensor([1.0, 0.5, 0.0])
+
+
+def _changes(effect: Effect, amplitude: Tensor, signal: Tensor, memory: Tensor) -> bool:
+    """Whether a signal after an effect changes with one of its amplitudes, which is zero here."""
+    before = effect.apply(signal, memory)
+    amplitude.fill_(TRIED_AMPLITUDE)
+    after = effect.apply(signal, memory)
+    amplitude.zero_()
+    return float((after - before).abs().max()) > UNCHANGED * float(signal.abs().max())
 
 
 def _check_one(effect: Effect, facts: ArmFacts, label: str) -> None:
@@ -100,6 +111,17 @@ def _check_one(effect: Effect, facts: ArmFacts, label: str) -> None:
         count = sum(value.numel() for value in amplitudes.values())
         slopes = zero.sensitivities(signal, along)
         check("sensitivities", slopes, (count, *signal.shape))
+        begin = 0
+        for name, value in zero.amplitudes().items():
+            of_name = slopes[begin : begin + value.numel()]
+            begin += value.numel()
+            if not of_name.any() and _changes(zero, value, signal, along):
+                raise wrong(
+                    f"the derivative of its result by the amplitude '{name}' is zero at zero, "
+                    "though the result changes with it",
+                    "a result that is linear in it near zero, by operations of torch without "
+                    "'detach'",
+                )
     quantities = effect.quantities()
     if not all(isinstance(each, Quantity) for each in quantities):
         raise wrong("'quantities' returned something else", "a list of Quantity")

@@ -77,21 +77,26 @@ def register_effect_file(path: str | Path, taken: Container[str] = ()) -> str:
         raise InputError(
             f"{path}: does not run ({type(error).__name__}: {str(error)[:120]}); correct it"
         ) from error
-    made = [
+    own = [
         value
         for value in vars(module).values()
-        if isinstance(value, type)
-        and issubclass(value, Effect)
-        and value.__module__ == module_name
-        and not value.__abstractmethods__
+        if isinstance(value, type) and issubclass(value, Effect) and value.__module__ == module_name
     ]
+    made = [kind for kind in own if not kind.__abstractmethods__]
     if len(made) != 1:
-        names = ", ".join(kind.__name__ for kind in made) or "none"
+        names = ", ".join(kind.__name__ for kind in made)
+        names = names or "; ".join(map(_lacking, own)) or "none"
         raise InputError(f"{path}: expected one complete Effect in the file, found {names}")
     _check(made[0], str(path))
     FILES[name] = EffectFile(made[0], str(path), hashlib.sha256(content).hexdigest())
     FILE_OF[made[0]] = FILES[name]
     return name
+
+
+def _lacking(kind: type[Effect]) -> str:
+    """Which methods an incomplete effect does not define, in words."""
+    missing = ", ".join(f"'{name}'" for name in sorted(kind.__abstractmethods__))
+    return f"{kind.__name__}, which lacks {missing}"
 
 
 def kind_of(name: str) -> str:

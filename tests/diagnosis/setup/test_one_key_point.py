@@ -81,3 +81,27 @@ FAULTS = {
 def test_a_fault_of_such_an_arm_is_found(name):
     change, kinds = FAULTS[name]
     assert set(found(change(bench())).kinds) == kinds
+
+
+def test_a_wrong_unit_of_one_key_point_may_be_that_of_the_model():
+    """Neither is compared with a length: the tip's distance from the base is not recorded."""
+
+    def in_metres(time_s, actuation):
+        return tip(time_s, actuation) / 1000
+
+    in_metres.static = True
+    model = callable_arm(given_callable(in_metres), [bench()], error_mm=VALIDATED_MM)
+    result = find_setup_faults(model, [bench()])
+    assert "mm were read as m; or the model returns m where mm are expected" in result.sentence
+    assert result.of_model == "the model returns m where mm are expected"
+    assert result.to_json()["of_model"] == result.of_model
+    assert found(FAULTS["turned"][0](bench())).of_model == ""
+    assert result.how_to_tell == "to distinguish them: compare a distance with a ruler"
+
+
+def test_the_floor_of_a_wrong_unit_is_in_the_unit_of_the_corrected_error():
+    right = bench()
+    in_cm = replace(right, key_points_mm=right.key_points_mm / 10, noise_mm=None)
+    result = found(in_cm)
+    assert result.kinds == ("length_unit",)
+    assert result.floor_mm == pytest.approx(0.04 * 3**0.5, rel=0.2)

@@ -243,6 +243,24 @@ def test_an_effect_of_a_user_says_its_single_numbers():
     assert [each.unit for each in said] == ["rad", "rad"]
 
 
+def test_an_effect_of_a_user_says_a_number_of_each_chamber_in_front_of_the_network():
+    gains = with_amplitudes(make_effect("gain_mismatch", FACTS), gain=[0.25, -0.5, 0.0])
+    said = super(type(gains), gains).readings()
+    assert in_words(said) == "gain share of chamber 1 +0.25, gain share of chamber 2 -0.5"
+    assert len(said) == 3
+
+
+def test_an_effect_of_a_user_says_a_number_of_each_axis_behind_the_network():
+    """The shift lies half as far in its plausible range as the turn, and is told beside it."""
+    moved = make_effect("misalignment", FACTS)
+    turn, shift = (each for each in moved.quantities() if each.name in ("turn_rad", "shift_mm"))
+    moved = with_amplitudes(moved, turn=[0.0, turn.high, 0.0], shift=[shift.high / 2, 0.0, 0.0])
+    said = in_words(super(type(moved), moved).readings())
+    assert f"turn along y +{turn.high:.2g} rad" in said
+    assert f"shift along x +{shift.high / 2:.2g} mm" in said
+    assert " along z " not in said
+
+
 def test_push_that_is_not_lost_is_gained():
     """A negative loss is told as a gain, with the ends of its interval turned round."""
     loss = Reading("chamber 4 loses {} of its push", 7.2, "%", signed=True, instead="it gains {}")

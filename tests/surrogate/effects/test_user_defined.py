@@ -223,7 +223,11 @@ def test_a_model_is_saved_with_the_file_that_its_effect_came_from(slack, tmp_pat
         ("broken.py", "1 / 0", r"does not run \(ZeroDivisionError"),
         ("exits.py", "import sys; sys.exit(3)", r"does not run \(SystemExit"),
         ("lost.py", EXAMPLE.replace('"material"', '"muscle"'), "expected a 'stage' of line"),
-        ("half.py", EXAMPLE.replace("def apply", "def applied"), "found none"),
+        (
+            "half.py",
+            EXAMPLE.replace("def apply", "def applied"),
+            "found Slack, which lacks 'apply'$",
+        ),
     ],
 )
 def test_a_bad_file_is_refused_in_one_line_and_leaves_nothing(tmp_path, name, text, complaint):
@@ -259,6 +263,11 @@ WRONG = [
     ("return signal -", "return 0.9 * signal -", ": it changes the signal at zero amplitude"),
     ("return signal -", "return signal[..., :2] * 1 -", ": raised RuntimeError|'apply' returned"),
     (".clamp(max=0)", ".log()", r": '(apply|sensitivities)' returned values that are not finite"),
+    (
+        "self.loss *",
+        "self.loss.detach() *",
+        ": the derivative of its result by the amplitude 'loss' is zero at zero, though the result",
+    ),
     ('{"loss": self.loss}', "{}", ": 'amplitudes' returned {}, expected at least one parameter"),
     ("return {}", 'return {"a": 1}', r": raised TypeError in \S+ line \d+: .*'a'"),
     ("self.loss.detach()", "self.lost.detach()", r": raised AttributeError in slack.py line \d+"),

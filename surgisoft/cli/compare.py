@@ -114,7 +114,7 @@ def compare(
         compared = compare_all(
             models,
             measured,
-            progress=tell,
+            progress=tell.step,
             before=earlier,
             paired=paired,
             predictions=predictions,

@@ -129,7 +129,7 @@ def diagnose(
         found = diagnose_model(
             model,
             measured,
-            lambda text: tell(next(stages), 6, text),
+            lambda text: tell.step(next(stages), 6, text),
             without=without or (),
             setup_tests=setup_tests,
             before=earlier,

@@ -40,6 +40,7 @@ from surgisoft.replay.viewer import (
     wait_for_port,
     web_address,
 )
+from surgisoft.units import actuation_word
 
 LINE_MM = 2.0
 """Spacing of the drawn centreline's points (mm)."""
@@ -216,7 +217,7 @@ def live_blueprint(bench: LiveBench, end_s: float | None = None) -> rrb.Blueprin
             axis_x=last_seconds(WINDOW_S) if end_s is None else time_axis(end_s),
         )
 
-    actuation = "Pressure" if bench.unit == "kPa" else "Actuation"
+    actuation = actuation_word(bench.unit).capitalize()
     plots = [
         plot("residual", "Residual of each key point (mm)", "righttop"),
         plot("alarm", "Alarm level (alarm at 1)", None),

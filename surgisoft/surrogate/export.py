@@ -46,6 +46,7 @@ from surgisoft.surrogate.effects import EFFECTS, Context, Effect
 from surgisoft.surrogate.effects.user_defined import kind_of
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import AWAY_SHARE, ArmModel
+from surgisoft.units import actuation_word
 
 FORMAT = 1
 """Version of `arm.json`."""
@@ -275,9 +276,9 @@ def describe_arm(graph: ArmGraph, worst_mm: float) -> dict[str, Any]:
         **files,
         "start": start,
         "step": step,
-        "start_meaning": "pressure (1, m) at which a run begins; an arm that begins away from rest "
-        f"by more than {AWAY_SHARE:.0%} of a range is assumed to have been held there for "
-        f"{STOOD_S:g} s, any other one to be at rest without a past",
+        "start_meaning": f"{actuation_word(spec.unit)} (1, m) at which a run begins; an arm that "
+        f"begins away from rest by more than {AWAY_SHARE:.0%} of a range is assumed to have been "
+        f"held there for {STOOD_S:g} s, any other one to be at rest without a past",
         "recording_columns": [
             f"{'c' if spec.actuation == 'commanded' else 'p'}{number}_{spec.unit}"
             for number in range(1, spec.chambers + 1)

@@ -9,6 +9,7 @@ import numpy as np
 
 from surgisoft.diagnosis.amend import Amendment, Fall, Track, errs_more
 from surgisoft.diagnosis.diagnose import Diagnosis
+from surgisoft.diagnosis.error_axes import axis_in_words
 from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
 from surgisoft.diagnosis.improve import NETWORK, Improvement, Round
 from surgisoft.diagnosis.pages.pictures import bodies, save
@@ -394,7 +395,8 @@ def what_is_left(result: Improvement, command: str = "") -> Section:
     if result.interrupted:  # the last diagnosis may be that of an earlier model
         return Section("What is left", parts)
     if last.axis:
-        parts.append(Text(f"The remaining error depends most on {last.axis}."))
+        called = axis_in_words(last.axis, result.model.spec.unit)
+        parts.append(Text(f"The remaining error depends most on {called}."))
     wrong = [each for each in result.parameters if not each.plausible]
     if wrong:
         names = ", ".join(f"{each.name} of {each.effect}" for each in wrong)

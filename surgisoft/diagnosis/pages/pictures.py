@@ -119,7 +119,7 @@ def loops(table: ResidualTable, unit: str, title: str = ""):
         for row, (offset, what) in enumerate(
             (
                 (0 * static, "tip, main direction [mm]"),
-                (static, "minus what pressure explains [mm]"),
+                (static, "minus what actuation explains [mm]"),
             )
         ):
             axis = axes[row, chamber]

@@ -2,7 +2,6 @@
 
 import inspect
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +27,7 @@ from surgisoft.report import (
     Text,
     write_page,
 )
-from surgisoft.report.charts import BLUE, GREEN, RED, chart, drawing
+from surgisoft.report.charts import BLUE, BROAD, BROAD_PX, GREEN, RED, chart, drawing
 from surgisoft.report.style import MUTED
 from surgisoft.surrogate.effects import known_effects
 from surgisoft.surrogate.effects.user_defined import kind_of
@@ -156,10 +155,6 @@ def parameter_table(parameters: tuple[Parameter, ...]) -> Table:
     return Table(header, rows)
 
 
-BROAD_PX = 560
-"""Width below which a chart over time scrolls, pixels."""
-
-
 def track_charts(tracks: dict[str, Track], floor_mm: float) -> list[Picture]:
     """A chart of each track by its caption, all with one scale of the error.
 
@@ -172,7 +167,7 @@ def track_charts(tracks: dict[str, Track], floor_mm: float) -> list[Picture]:
     pictures = []
     with drawing():
         for caption, (time_s, before, after) in thinned.items():
-            figure, axis = plt.subplots(figsize=(7.2, 2.8))
+            figure, axis = plt.subplots(figsize=(BROAD, 3.0))
             for values, colour, label in ((before, RED, "before"), (after, BLUE, "after")):
                 axis.plot(*with_gaps(time_s, values), c=colour, lw=1, label=label)
             axis.axhline(floor_mm, c=MUTED, lw=0.8, ls="--", label="noise floor")
@@ -180,7 +175,7 @@ def track_charts(tracks: dict[str, Track], floor_mm: float) -> list[Picture]:
             axis.set_ylabel("error [mm]")
             axis.set_ylim(0, 1.05 * most)
             figure.legend(loc="outside lower center", ncols=3)
-            pictures.append(replace(chart(figure, caption, caption), least_px=BROAD_PX))
+            pictures.append(chart(figure, caption, caption, BROAD_PX))
     return pictures
 
 

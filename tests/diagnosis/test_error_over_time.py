@@ -51,7 +51,8 @@ def test_the_loops_of_many_chambers_keep_their_size(chambers):
     assert sorted(axis.get_xlabel() for axis in drawn) == sorted(2 * of)
     for axis in drawn:
         box = axis.get_position()
-        assert box.width * wide > 1.8 and box.height * high > 1.5
+        assert box.width * wide > 1.8
+        assert box.height * high > 1.5
     assert all(not axis.axison for axis in figure.axes if not axis.lines)
     plt.close(figure)
 

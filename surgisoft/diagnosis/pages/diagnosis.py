@@ -384,7 +384,7 @@ def effects_chart(found: Diagnosis):
         axis.set_xlabel(f"{blocks} {left} with this effect added [mm]")
         axis.set_xlim(left=0)
         figure.legend(fontsize=8, loc="outside upper center", ncols=3)
-        return chart(figure, f"{blocks.capitalize()} {what} with each effect", least_px=BROAD_PX)
+        return chart(figure, f"{blocks.capitalize()} {what} with each effect", "", BROAD_PX)
 
 
 def along_chart(found: Diagnosis):

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor, nn
 
 from surgisoft.errors import InputError
-from surgisoft.files import new_folder, read_json, write_json
+from surgisoft.files import check_export_folder, new_folder, read_json, write_json
 from surgisoft.graphs import (
     Call,
     DoesNotTrace,
@@ -183,7 +183,10 @@ class _Start(nn.Module):
 
 
 def export_arm(
-    model: ArmModel, folder: str | Path, recordings: Mapping[str, History] | None = None
+    model: ArmModel,
+    folder: str | Path,
+    recordings: Mapping[str, History] | None = None,
+    force: bool = False,
 ) -> list[Path]:
     """Write an arm model for other programs; returns the files.
 
@@ -191,11 +194,11 @@ def export_arm(
     TorchScript and ONNX. recordings: by their names; the files are also compared with the model
     over every row of each, and `arm.json` has the largest difference of a coordinate in mm under
     `recordings`. Raises InputError where the folder is in use, where an effect of the model cannot
-    be written, and where a difference is larger than `TOLERANCE_MM`.
+    be written, and where a difference is larger than `TOLERANCE_MM`. force: replace an earlier
+    export of an arm model.
     """
     folder = Path(folder)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: already exists; choose another name")
+    check_export_folder(folder, "arm.json", force)
     try:
         graph = ArmGraph(model)
         for name, effect in graph.model.effects.items():
@@ -203,7 +206,7 @@ def export_arm(
                 _check_effect(name, effect, graph)
         called = isinstance(graph.model.network, CallableNetwork)
         write, files = (_write_code, CALLABLE_FILES) if called else (_write, FILES)
-        with new_folder(folder) as fresh:
+        with new_folder(folder, [*FILES, *CALLABLE_FILES]) as fresh:
             worst, over = write(graph, fresh, recordings or {})
             about = describe_arm(graph, worst)
             write_json(fresh / "arm.json", about | ({"recordings": over} if over else {}))

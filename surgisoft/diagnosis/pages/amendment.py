@@ -402,8 +402,7 @@ def what_is_left(result: Improvement, command: str = "") -> Section:
         parts.append(Text(text))
     if last.next_experiment:
         plan = last.next_experiment
-        pairs = ", ".join(" from ".join(pair) for pair in plan.separates) or "none for certain"
-        text = f"Record next: {plan.name}, {plan.minutes:g} minutes; it distinguishes {pairs}."
+        text = f"Record next: {plan.name}, {plan.minutes:g} minutes; it {plan.in_words}."
         parts.append(Text(text))
     if last.next_command and not (result.steps and "amend" in last.next_command):
         parts.append(Command(command or last.command("NEW", "REC")))

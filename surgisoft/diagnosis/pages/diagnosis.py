@@ -110,16 +110,10 @@ def diagnosis_page(found: Diagnosis, title: str, command: str = "") -> Page:
         parts.append(_refit(found.refit))
     if found.next_experiment:
         plan = found.next_experiment
-        pairs = ", ".join(" from ".join(pair) for pair in plan.separates) or "none for certain"
         parts.append(
             Section(
                 "Next experiment",
-                [
-                    Text(
-                        f"{plan.name}: {plan.minutes:g} minutes on the bench; "
-                        f"distinguishes {pairs}."
-                    )
-                ],
+                [Text(f"{plan.name}: {plan.minutes:g} minutes on the bench; {plan.in_words}.")],
             )
         )
     if verdict.effects:

@@ -451,7 +451,16 @@ class _Session:
             length = float(np.linalg.norm(rest[-1] - rest[0]))
         title = f"{name} on {self._rig_name}"
         tracks = not self.request.scheduled
-        bench = LiveBench(rig.chambers, rig.key_planes, rig.unit, length, title, tracks)
+        bench = LiveBench(
+            rig.chambers,
+            rig.key_planes,
+            rig.unit,
+            length,
+            title,
+            tracks,
+            self.model.validation.rmse_mm,
+            None if rig.gravity is None else tuple(np.asarray(rig.gravity, float).tolist()),
+        )
         sinks = self.sinks
         with live_view(
             bench,

@@ -44,7 +44,7 @@ def error_scale(
     rounded up to 1, 2 or 5 times a power of ten.
     """
     if large_mm is None:
-        large_mm = _round_up(max(quantile(error) for error in errors_mm))
+        large_mm = rounded_up(max(quantile(error) for error in errors_mm))
     return Scale(large_mm, stretch_of(measured_mm, large_mm), body_size(measured_mm))
 
 
@@ -54,7 +54,7 @@ def quantile(error_mm: np.ndarray) -> float:
     return float(np.quantile(known, LARGE)) if len(known) else 0.0
 
 
-def _round_up(value: float) -> float:
+def rounded_up(value: float) -> float:
     """The next of 1, 2 and 5 times a power of ten, so that scales of several pictures agree."""
     if value <= 0.0:
         return 1.0

@@ -74,6 +74,22 @@ def new_file(path: str | Path, noted: bool = True) -> Iterator[Path]:
         fresh.unlink(missing_ok=True)
 
 
+def check_export_folder(folder: str | Path, mark: str, force: bool) -> None:
+    """Raise InputError unless a folder is free for an export, or holds one and `force` is given.
+
+    mark: the file by which an earlier export is known.
+    """
+    folder = Path(folder)
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        return
+    if not (folder / mark).is_file():
+        raise InputError(f"{folder}: already exists, without {mark}; choose another name")
+    if not force:
+        raise InputError(
+            f"{folder}: already exists; choose another name or pass --force (in Python force=True)"
+        )
+
+
 @contextlib.contextmanager
 def new_folder(folder: str | Path, own: Sequence[str] = ()) -> Iterator[Path]:
     """A temporary folder to fill; it becomes `folder` when the block ends without an exception.

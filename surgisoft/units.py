@@ -18,6 +18,12 @@ DEGREES_PER = {"deg": 1.0, "rad": 57.29577951308232, "rev": 360.0}
 """Degrees in each unit of angle."""
 
 
+def actuation_word(unit: str) -> str:
+    """What an actuation in a unit is called: `pressure`, or `actuation` where it is none, such as
+    the volume of a syringe in ml."""
+    return "pressure" if unit in KPA_PER else "actuation"
+
+
 def is_displacement(unit: str) -> bool:
     """Whether an actuation is how far something moves: tendons in mm, motors in degrees."""
     return unit in MM_PER or unit in DEGREES_PER

@@ -27,7 +27,7 @@ from surgisoft.agents.controller_runner import Controller
 from surgisoft.agents.learned import LearnedPolicy
 from surgisoft.agents.observer import ObserverGains
 from surgisoft.errors import InputError
-from surgisoft.files import json_safe, new_folder, write_json
+from surgisoft.files import check_export_folder, json_safe, new_folder, read_json, write_json
 from surgisoft.graphs import (
     Call,
     DoesNotTrace,
@@ -39,6 +39,8 @@ from surgisoft.surrogate.callables.exported import described, file_text, functio
 from surgisoft.tasks.base import DocumentedTask, Task
 from surgisoft.tasks.describe import describe_agents
 
+ABOUT = "policy.json"
+"""File that says what an exported policy takes and gives."""
 CODE = "controller_code.py"
 """File of a controller whose arm model calls Python code."""
 FORMAT = 2
@@ -72,15 +74,16 @@ def export(
     folder: Path,
     task: Task | None = None,
     gains: ObserverGains | None = None,
+    force: bool = False,
 ) -> list[Path]:
     """Write a policy for other programs, each file checked against the policy; returns the files.
 
-    task: where the policy acts, None: the task of its run. gains: of the observer.
+    task: where the policy acts, None: the task of its run. gains: of the observer. force: replace
+    an earlier export of a policy. Raises InputError where the folder is in use.
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: already exists; choose another name")
+    check_export_folder(folder, ABOUT, force)
     task = task or policy.run.task()
-    with new_folder(folder) as fresh:
+    with new_folder(folder, _files_of(folder)) as fresh:
         written = []
         for agent, actor in policy.actors.items():
             width = policy.run.agents[agent]["observation"]
@@ -106,9 +109,19 @@ def export(
             content |= {"controller": None, "note": str(error)}
             for file in [*fresh.glob("controller.*"), fresh / CODE]:  # what was written of it
                 file.unlink(missing_ok=True)
-        write_json(fresh / "policy.json", content)
-        names = [*(file.name for file in written), "policy.json"]
+        write_json(fresh / ABOUT, content)
+        names = [*(file.name for file in written), ABOUT]
     return [folder / name for name in names]
+
+
+def _files_of(folder: Path) -> list[str]:
+    """Names of the files of an earlier export of a policy; empty without one."""
+    if not (folder / ABOUT).is_file():
+        return []
+    agents = read_json(folder / ABOUT).get("agents") or {}
+    stems = [*agents, "controller"]
+    names = [ABOUT, CODE, "controller.py"]
+    return names + [f"{stem}{suffix}" for stem in stems for suffix in (".pt", ".onnx")]
 
 
 def controller_of(

@@ -110,7 +110,7 @@ def amend(
             measured,
             names,
             not keep_network,
-            lambda text: tell(next(stages), 4, text),
+            lambda text: tell.step(next(stages), 4, text),
             before=earlier,
             paired=paired,
             refit=refit,

@@ -114,7 +114,7 @@ def compare(
         compared = compare_all(
             models,
             measured,
-            progress=tell,
+            progress=tell.step,
             before=earlier,
             paired=paired,
             predictions=predictions,
@@ -228,10 +228,10 @@ def _show(result) -> None:
             counted = "alone" if each.static else "beyond actuation"
             low, high = (f"{100 * value:.0f}" for value in each.ci95)
             share = f"{100 * each.share:3.0f} % ({low} .. {high})"
-            print(f"  {each.axis:16s} explains {share:16s} {counted}")
+            print(f"  {each.in_words:16s} explains {share:16s} {counted}")
     for each in result.change_axes[:AXES_SHOWN]:
         if each.share >= LEAST_SHOWN:
-            print(f"  {each.axis:16s} explains {100 * each.share:3.0f} % of the change")
+            print(f"  {each.in_words:16s} explains {100 * each.share:3.0f} % of the change")
     for moment in result.worst:
         print(
             f"  worst: {moment.error_mm:.3f} mm at key point k{moment.key_point}, "

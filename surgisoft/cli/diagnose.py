@@ -129,7 +129,7 @@ def diagnose(
         found = diagnose_model(
             model,
             measured,
-            lambda text: tell(next(stages), 6, text),
+            lambda text: tell.step(next(stages), 6, text),
             without=without or (),
             setup_tests=setup_tests,
             before=earlier,
@@ -281,9 +281,7 @@ def _show(found) -> None:
         _show_refit(found.refit)
     if found.next_experiment:
         plan = found.next_experiment
-        pairs = ", ".join(" from ".join(pair) for pair in plan.separates)
-        pairs = pairs or "none for certain"
-        print(f"next experiment: {plan.name}, {plan.minutes:g} minutes, distinguishes {pairs}")
+        print(f"next experiment: {plan.name}, {plan.minutes:g} minutes, {plan.in_words}")
     print(f"{found.seconds:.1f} s")
 
 

@@ -7,7 +7,7 @@ import typer
 
 from surgisoft.cli import app
 from surgisoft.cli.inputs import read_recordings
-from surgisoft.cli.options import EffectFiles
+from surgisoft.cli.options import EffectFiles, Force
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
 from surgisoft.files import read_json
@@ -51,6 +51,7 @@ def export(
         ),
     ] = None,
     effect_files: EffectFiles = None,
+    force: Force = False,
 ) -> None:
     """Write a run's policies, or an arm model, as ONNX and TorchScript, or as NumPy code.
 
@@ -70,22 +71,22 @@ def export(
         raise InputError(f"{source}: is a training run; --data is for arm models, see --check")
     passed = True
     if is_model:
-        files = _model(source, output, data)
+        files = _model(source, output, data, force)
     else:
-        files, passed = _run(source, output, which or "best", check)
+        files, passed = _run(source, output, which or "best", check, force)
     for file in files:
         print(f"wrote {file}")
     if not passed:
         raise typer.Exit(DIFFERS)
 
 
-def _model(source: Path, output: Path, data: list[Path] | None) -> list[Path]:
+def _model(source: Path, output: Path, data: list[Path] | None, force: bool) -> list[Path]:
     from surgisoft.measurement.exporting import export_arm
     from surgisoft.surrogate.export import differences
 
     measured = read_recordings(data) if data else []
     with progress(f"export {source}"):
-        files = export_arm(source, output, measured)
+        files = export_arm(source, output, measured, force)
     if read_json(output / "arm.json")["state"]["elapsed"]:
         print(
             "the model drifts with the elapsed time, which counts from 'start': where a run begins "
@@ -99,7 +100,9 @@ def _model(source: Path, output: Path, data: list[Path] | None) -> list[Path]:
     return files
 
 
-def _run(source: Path, output: Path, which: str, check: bool) -> tuple[list[Path], bool]:
+def _run(
+    source: Path, output: Path, which: str, check: bool, force: bool
+) -> tuple[list[Path], bool]:
     """The files, and whether the controller passed its check, where one was asked for."""
     from surgisoft.agents.controller_runner import Controller
     from surgisoft.agents.export import export as export_policy
@@ -109,7 +112,7 @@ def _run(source: Path, output: Path, which: str, check: bool) -> tuple[list[Path
     policy = LearnedPolicy(source, which=which)
     task = policy.run.task()
     with progress(f"export {source}"):
-        files = export_policy(policy, output, task)
+        files = export_policy(policy, output, task, force=force)
     if not (output / "controller.py").is_file():
         note = read_json(output / "policy.json")["note"]
         print(f"controller: not exported, only the policies: {note}")

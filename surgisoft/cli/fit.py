@@ -130,10 +130,17 @@ def fit(
 
     claim_folder(output, force)
 
+    trainings, last = 0, ("", 0)
+
     def tell(stage: str, epoch: int, of: int, loss: float) -> None:
+        nonlocal trainings, last
+        # The same effect may be trained twice in a row, for less and for more epochs.
+        trainings += stage != last[0] or epoch <= last[1]
+        last = stage, epoch
         # The kernel's loss is that of the result, the others weigh key points by their motion.
         what = "held-out RMSE" if stage == "kernel" else "held-out RMS weighted by motion"
-        report(epoch, of, f"{stage}: {what} {rms_of_loss(stage, loss):.4f} mm")
+        part = f"training {trainings} ({stage}), {epoch} of {of}"
+        report.step(epoch, of, f"{part}: {what} {rms_of_loss(stage, loss):.4f} mm")
 
     with progress("fit") as report:
         try:

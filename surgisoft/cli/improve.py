@@ -84,13 +84,13 @@ def improve(
 
         def after(each) -> None:
             done.append(each)
-            tell(len(done), most + 2, each.step or each.verdict)
+            tell.step(len(done), most + 2, each.step or each.verdict)
 
         def within(share: float, total: float, note: str = "") -> None:
             """Progress of a fit together with the network, which is part of a round."""
             nonlocal furthest
             furthest = max(furthest, len(done) + (share / total if total else 0.0))
-            tell(furthest, most + 2, note)
+            tell.step(furthest, most + 2, note)
 
         try:
             result = improve_model(

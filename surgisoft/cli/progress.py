@@ -3,16 +3,17 @@
 import contextlib
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from datetime import datetime, timedelta
-
-from surgisoft.progress import Progress
 
 NOTEBOOK = "JPY_PARENT_PID"
 """Environment variable of what a cell of a notebook starts: Jupyter sets it for its kernels."""
 LINE_EVERY_S = 30.0
 """Time between two lines where there is no terminal, s."""
+SHORTEST_WAIT_S = 1.0
+"""Shortest time between two looks at whether a line is due, s."""
 LEAST_SHARE = 0.01
 """Share of the work from which its rate is extrapolated. The first steps of a first run are mostly
 compilation: at 0.04 % of the demonstration, the estimate was four days for work of five minutes."""
@@ -20,10 +21,62 @@ HOURS_FROM_S = 7200.0
 """Remaining time from which it is given in hours, s."""
 
 
+class Report:
+    """Function of (done, total, note) that shows how far work is: a `surgisoft.progress.Progress`.
+
+    Work that reports nothing for long is told again, so that it is seen to go on.
+    """
+
+    def __init__(self, title: str, draw: Callable[[float, float, str, str], None] | None):
+        """draw: shows done, total, note and pace in a terminal; None: lines on standard error."""
+        self._title, self._draw, self._pace = title, draw, Pace()
+        self._begin = self._told = time.monotonic()
+        self._present: tuple[float, float, str, bool] | None = None
+        self._lock = threading.Lock()
+
+    def __call__(self, done: float, total: float, note: str = "") -> None:
+        """Report `done` of `total`, from which the end of the work is extrapolated."""
+        self._report(done, total, note, True)
+
+    def step(self, done: float, total: float, note: str = "") -> None:
+        """Report the present one of steps that take unlike times, which tell no end."""
+        self._report(done, total, note, False)
+
+    def _report(self, done: float, total: float, note: str, even: bool) -> None:
+        with self._lock:
+            self._present = (done, total, note, even)
+            pace = self._pace(done, total) if even else ""
+            if self._draw is not None:
+                self._draw(done, total, note, pace)
+            elif time.monotonic() - self._told > LINE_EVERY_S:
+                self._told = time.monotonic()
+                self._tell(pace if even else self._passed)
+
+    @property
+    def _passed(self) -> str:
+        return f"{self._told - self._begin:.0f} s so far"
+
+    def _tell(self, time_told: str) -> None:
+        assert self._present is not None
+        done, total, note, even = self._present
+        share = f"{done / total:.0%}" if total and even else ""
+        parts = ", ".join(part for part in (share, note, time_told) if part)
+        print(f"surgisoft: {self._title}: {parts}", file=sys.stderr, flush=True)
+
+    def repeat(self, ended: threading.Event) -> None:
+        """Tell the present state every `LINE_EVERY_S` in which nothing was reported, to the end."""
+        while not ended.wait(max(SHORTEST_WAIT_S, LINE_EVERY_S + self._told - time.monotonic())):
+            with self._lock:
+                if time.monotonic() - self._told >= LINE_EVERY_S:
+                    self._present = self._present or (0.0, 0.0, "", False)
+                    done, total, _, even = self._present
+                    self._told = time.monotonic()
+                    self._tell((even and self._pace(done, total)) or self._passed)
+
+
 @contextlib.contextmanager
-def progress(title: str) -> Iterator[Progress]:
-    """Show a bar with the rate, the time left and the end; yields a function of
-    (done, total, note)."""
+def progress(title: str) -> Iterator[Report]:
+    """Show a bar with the rate, the time left and the end; yields the function that reports."""
     from surgisoft.cli import work_begins
 
     work_begins()
@@ -34,6 +87,17 @@ def progress(title: str) -> Iterator[Progress]:
     console = Console(stderr=True)
     # Notebooks force colours into a pipe, and run `!command` in a pseudo-terminal.
     terminal = console.is_terminal and sys.stderr.isatty() and NOTEBOOK not in os.environ
+    # Where there is no terminal, a disabled bar of rich 13 still ends with an empty line.
+    if not terminal:
+        report, ended = Report(title, None), threading.Event()
+        teller = threading.Thread(target=report.repeat, args=(ended,), daemon=True)
+        teller.start()
+        try:
+            yield report
+        finally:
+            ended.set()
+            teller.join()
+        return
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -42,24 +106,13 @@ def progress(title: str) -> Iterator[Progress]:
         TextColumn("{task.fields[pace]}"),
         TextColumn("{task.fields[note]}"),
     )
-    # Where there is no terminal, a disabled bar of rich 13 still ends with an empty line.
-    bar = RichProgress(*columns, console=console, transient=True) if terminal else None
-    with bar or contextlib.nullcontext():
-        task = bar.add_task(title, total=None, note="", pace="") if bar is not None else None
-        last, paced = time.monotonic(), Pace()
+    with RichProgress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(title, total=None, note="", pace="")
 
-        def report(done: float, total: float, note: str = "") -> None:
-            nonlocal last
-            pace = paced(done, total)
-            if bar is not None and task is not None:
-                bar.update(task, completed=done, total=total, note=note, pace=pace)
-            elif time.monotonic() - last > LINE_EVERY_S:
-                last = time.monotonic()
-                share = f"{done / total:.0%}" if total else ""
-                parts = ", ".join(part for part in (share, note, pace) if part)
-                print(f"surgisoft: {title}: {parts}", file=sys.stderr, flush=True)
+        def draw(done: float, total: float, note: str, pace: str) -> None:
+            bar.update(task, completed=done, total=total, note=note, pace=pace)
 
-        yield report
+        yield Report(title, draw)
 
 
 class Pace:

@@ -220,7 +220,7 @@ class Comparison:
         return f"no test of the model, {seen}"
 
     def _depends(self) -> str:
-        main = [f"{a.axis} ({100 * a.share:.0f} %)" for a in self.main_axes]
+        main = [f"{a.in_words} ({100 * a.share:.0f} %)" for a in self.main_axes]
         if not main:
             return "it depends clearly on no single axis"
         text = f"it depends most on {main[0]}"

@@ -761,7 +761,7 @@ def with_axis(result: Diagnosis, problem: Problem) -> Diagnosis:
     axis = next((each for each in shares(problem) if each.clear), None)
     if axis is None:
         return result
-    most = f"the error depends most on {axis.axis} ({100 * axis.share:.0f} %)"
+    most = f"the error depends most on {axis.in_words} ({100 * axis.share:.0f} %)"
     text = f"{result.verdict.sentence}; {most}"
     return replace(result, axis=axis.axis, verdict=replace(result.verdict, sentence=text))
 

@@ -15,6 +15,7 @@ import numpy as np
 from surgisoft.diagnosis.history_features import TIMES_S
 from surgisoft.diagnosis.residuals import Problem, ResidualTable
 from surgisoft.diagnosis.statistics import block_interval, block_sums, cross_validated_ridge
+from surgisoft.units import actuation_word
 
 LAG_S = 0.5
 """Low pass whose distance from the actuation is the axis `lag`, s; one of `TIMES_S`."""
@@ -303,9 +304,20 @@ class AxisShare:
     """Error and bias over the values of each column."""
 
     @property
+    def in_words(self) -> str:
+        """The axis as texts and charts call it."""
+        return axis_in_words(self.axis, self.unit)
+
+    @property
     def clear(self) -> bool:
         """Whether the share is large enough to be named, and surely above zero."""
         return self.share >= LEAST_SHARE and self.ci95[0] > 0
+
+
+def axis_in_words(axis: str, unit: str) -> str:
+    """What texts and charts call an axis, whose values have a unit: not every actuation is a
+    pressure."""
+    return actuation_word(unit) if axis == "pressure" else axis
 
 
 def shares(problem: Problem) -> list[AxisShare]:

@@ -164,14 +164,22 @@ def open_model(
         named = given_callable(model)
     if named is not None:
         check_same_arm([*measured, *(earlier or [])])
-        return Opened(callable_arm(named, measured, earlier, error_mm), measured, earlier)
+        arm = callable_arm(named, measured, earlier, error_mm)
+        return Opened(_warning_if_slow(arm), measured, earlier)
     if error_mm is not None:
         raise InputError(
             "the model's folder states its validated error: expected --model-error only with a "
             "callable or with predictions"
         )
     assert isinstance(model, ArmModel | str | Path)
-    return Opened(load_model(model), measured, earlier)
+    return Opened(_warning_if_slow(load_model(model)), measured, earlier)
+
+
+def _warning_if_slow(model: ArmModel) -> ArmModel:
+    """The model, whose callable, if it is one, says so where it is slow."""
+    if isinstance(model.network, CallableNetwork):
+        model.network.warns_if_slow = True
+    return model
 
 
 def callable_arm(

@@ -543,8 +543,7 @@ def fit_detector(
             f"the clean reference has {count * design.block_s:g} s, expected at least "
             f"{LEAST_BLOCKS * design.block_s:g} s; record longer"
         )
-    folds = [[run] for run in runs] if len(runs) >= FOLDS else _fifths(runs)
-    held = _held_out(folds, design.block_s)
+    held = _held_out(_folds(runs), design.block_s)
     ridge = min(RIDGES, key=lambda each: sum((part.left**2).sum() for part in held[each]))
     found, squares, counts = _whitened(held[ridge], design, elsewhere_mm2)
     enlargement = _enlargement(squares, counts, design)
@@ -648,13 +647,51 @@ def _fast_variance(whitening: Whitening, parts: Sequence[_HeldOut]) -> np.ndarra
     return np.where(moves >= VISITS, np.maximum(bound, 1.0), np.inf)
 
 
+def repeated_share(
+    schedule: Sequence[tuple[np.ndarray, np.ndarray]],
+    span: np.ndarray,
+    design: AlarmDesign | None = None,
+) -> float:
+    """Share of a reference whose motions its other parts cover, by what will be commanded [-].
+
+    schedule: times (T,) [s] and actuation (T, m) [unit] of each run; span: (m,) range of the
+    actuation [unit]. What is measured follows with lags and noise, so that its share is about that.
+    1 where there is less than two folds to compare.
+    """
+    design = design or AlarmDesign()
+    half_range = np.asarray(span, np.float64) / 2.0
+    stretches = [Stretch(t_s, np.zeros((len(t_s), 1, 3)), u) for t_s, u in schedule]
+    runs = [blocks_of(stretch, half_range, design.block_s) for stretch in stretches]
+    runs = [run for run in runs if len(run.position) > 1]
+    folds = _folds(runs) if runs else []
+    if len(folds) < 2:
+        return 1.0
+    covered = []
+    for k, fold in enumerate(folds):
+        others = [run.position for j, other in enumerate(folds) if j != k for run in other]
+        coverage = Coverage.of(others, design.block_s)
+        covered += [coverage.covers(motion(run.position)) for run in fold]
+    return float(np.concatenate(covered).mean())
+
+
+def _folds(runs: Sequence[Blocks]) -> list[list[Blocks]]:
+    """The folds of a reference: its runs, or parts of them where they are few."""
+    return [[run] for run in runs] if len(runs) >= FOLDS else _fifths(runs)
+
+
 def _fifths(runs: Sequence[Blocks]) -> list[list[Blocks]]:
-    """Five folds of consecutive blocks of a few runs."""
+    """Five folds of consecutive blocks of a few runs, one run after another.
+
+    Runs often repeat one motion, whose same part is in other folds then and judges it.
+    """
     folds: list[list[Blocks]] = [[] for _ in range(FOLDS)]
-    for run in runs:
-        for k, rows in enumerate(np.array_split(np.arange(len(run.position)), FOLDS)):
-            if len(rows) > 1:
-                folds[k].append(run.part(rows))
+    of_run = np.repeat(np.arange(len(runs)), [len(run.position) for run in runs])
+    of_block = np.concatenate([np.arange(len(run.position)) for run in runs])
+    for k, rows in enumerate(np.array_split(np.arange(len(of_run)), FOLDS)):
+        for number in np.unique(of_run[rows]):
+            part = of_block[rows[of_run[rows] == number]]
+            if len(part) > 1:
+                folds[k].append(runs[number].part(part))
     return [fold for fold in folds if fold]
 
 

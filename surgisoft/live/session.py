@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import itertools
 import math
 import os
 import signal
@@ -35,6 +36,7 @@ from surgisoft.live.change import (
     Detector,
     Stretch,
     fit_detector,
+    repeated_share,
     stretches,
 )
 from surgisoft.live.clock import Clock, Pace, Timing
@@ -88,6 +90,11 @@ SUSPICIOUS = 2.0
 LEAD_IN_S = 60.0
 """Time before the change that `*-after` keeps without key points, so that a model's memory is
 that of the run [s]."""
+SURELY_REPEATED = 0.85
+"""Share of a reference, by its schedule, that is enough for `LEAST_REPEATED` as measured: rests
+between runs and lags make the measured one smaller [-]."""
+LONGER = (1.25, 1.5, 2.0, 3.0, 5.0)
+"""Factors on the time of a reference that are tried where it does not repeat its motions [-]."""
 REHEARSED = 3
 """Number of steps of a policy in simulation before the run."""
 PRIORITY = 20
@@ -360,6 +367,8 @@ class _Session:
             place = self._place(task, config, rate_hz)
             if before:
                 self.charts = Charts(self._detector(before))
+            elif protocol is not None:
+                self._check_reference(protocol, rig.period_s)
             pace: Pace = "rig"
             if is_simulated(rig):
                 pace = "real" if request.clock == "real" else "simulated"
@@ -444,7 +453,16 @@ class _Session:
             length = float(np.linalg.norm(rest[-1] - rest[0]))
         title = f"{name} on {self._rig_name}"
         tracks = not self.request.scheduled
-        bench = LiveBench(rig.chambers, rig.key_planes, rig.unit, length, title, tracks)
+        bench = LiveBench(
+            rig.chambers,
+            rig.key_planes,
+            rig.unit,
+            length,
+            title,
+            tracks,
+            self.model.validation.rmse_mm,
+            None if rig.gravity is None else tuple(np.asarray(rig.gravity, float).tolist()),
+        )
         sinks = self.sinks
         with live_view(
             bench,
@@ -744,6 +762,40 @@ class _Session:
         detector = fit_detector(runs, span, self.request.alarm, elsewhere(self.model))
         self._tell_reference(detector)
         return detector
+
+    def _check_reference(self, protocol: Protocol, period_s: float) -> None:
+        """Warn before the run where its schedule will not repeat its motions in the reference."""
+        once = [commands for _, commands in runs_of(protocol, period_s)]
+        scheduled_s = period_s * sum(map(len, once))
+        seconds = 60.0 * self.request.minutes if self.request.minutes else scheduled_s
+        reference_s, span = self.request.reference_s, np.array(self.model.spec.span)
+        if seconds <= reference_s:
+            return
+
+        def repeated(least_s: float) -> float:
+            """What is repeated in the first seconds of the run."""
+            runs, left = [], round(least_s / period_s)
+            for commands in itertools.cycle(once):
+                part = commands[:left]
+                runs.append((period_s * np.arange(len(part)), np.asarray(part, np.float64)))
+                left -= len(part)
+                if left <= 0:
+                    return repeated_share(runs, span, self.request.alarm)
+            return 1.0
+
+        share = repeated(reference_s)
+        if share >= LEAST_REPEATED:
+            return
+        longer = [reference_s * times for times in LONGER if reference_s * times < seconds]
+        enough = next((each for each in longer if repeated(each) >= SURELY_REPEATED), None)
+        advice = "a recording of the same kind of motion (--before)"
+        if enough is not None:
+            advice = f"a longer reference (--clean {enough:g}), or {advice}"
+        self.on_warning(
+            f"the first {reference_s:.0f} s of the schedule, the reference, repeat {share:.0%} of "
+            f"their motions, expected at least {LEAST_REPEATED:.0%}: no change can be detected "
+            f"with them. Give {advice}"
+        )
 
     def _tell_reference(self, detector: Detector) -> None:
         text = (

@@ -13,7 +13,10 @@ from surgisoft.surrogate.model import ArmModel
 
 
 def export_arm(
-    model: ArmModel | str | Path, folder: str | Path, recordings: Recordings = ()
+    model: ArmModel | str | Path,
+    folder: str | Path,
+    recordings: Recordings = (),
+    force: bool = False,
 ) -> list[Path]:
     """Write an arm model as ONNX and TorchScript into a new folder; returns the files.
 
@@ -25,7 +28,8 @@ def export_arm(
     from the model by more than `surgisoft.surrogate.export.TOLERANCE_MM`.
 
     model: a model, its folder, or the name of a callable that states its range. recordings: over
-    whose rows files and model are compared too (`surgisoft.surrogate.export.differences`).
+    whose rows files and model are compared too (`surgisoft.surrogate.export.differences`). force:
+    replace an earlier export of an arm model.
     """
     none = isinstance(recordings, list | tuple) and not recordings
     arm, measured = load_model(model), [] if none else load_recordings(recordings)
@@ -34,4 +38,4 @@ def export_arm(
     for each in measured:
         called = each.name if names.count(each.name) == 1 else each.label
         histories[free_name(called, histories)] = history_of([each], arm.spec.actuation)
-    return export_histories(arm, folder, histories)
+    return export_histories(arm, folder, histories, force)

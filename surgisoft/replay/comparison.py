@@ -29,6 +29,7 @@ from surgisoft.replay.recording import LEGEND, LEVELS, Columns, new_recording
 from surgisoft.replay.shapes import finer
 from surgisoft.tasks.episodes.parts import Event
 from surgisoft.time_axis import continued, pauses
+from surgisoft.units import actuation_word
 
 MOST_ROWS = 6000
 """Longer comparisons are thinned evenly to so many rows."""
@@ -207,8 +208,9 @@ def _lines(errors: Mapping[str, np.ndarray], pressure, unit: str) -> dict[str, l
             for i, values in enumerate(error.T)
         ]
     if pressure is not None:
-        what, one = ("Pressure", "chamber") if unit == "kPa" else ("Actuation", "channel")
-        groups[f"{what} ({unit})"] = [
+        what = actuation_word(unit)
+        one = "chamber" if what == "pressure" else "channel"
+        groups[f"{what.capitalize()} ({unit})"] = [
             Line(f"/plots/pressure/p{i + 1}", f"{one} {i + 1}", pressure[:, i], series_colour(i))
             for i in range(pressure.shape[1])
         ]

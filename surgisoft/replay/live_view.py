@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator
+import textwrap
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from surgisoft.error_scale import STRETCH_OF_ERROR, bar_length, rounded_up
 from surgisoft.errors import InputError
 from surgisoft.files import new_file
 from surgisoft.replay.colours import (
@@ -40,13 +42,21 @@ from surgisoft.replay.viewer import (
     wait_for_port,
     web_address,
 )
+from surgisoft.units import actuation_word
 
 LINE_MM = 2.0
 """Spacing of the drawn centreline's points (mm)."""
-STRETCH = 10.0
-"""Factor by which the drawn residual is magnified."""
 LARGE_MM = 1.0
-"""Residual at which the colour scale of the key points ends (mm)."""
+"""Smallest residual at which the colour scale of the key points ends (mm)."""
+LARGE_TIMES = 3.0
+"""That residual in validated errors of the model, which is rounded up: a change that is told leaves
+a few of them."""
+LEGEND_SHARE = 0.04
+"""Height of one entry of a legend, as a share of the column of plots in a window of 1000 px."""
+MOST_LEGEND = 0.5
+"""Largest share of that column that a plot takes for its legend."""
+EVENT_COLUMNS = 52
+"""Characters of a line of the events: the viewer shows one line of a text, cut at the edge."""
 WINDOW_S = 60.0
 """Time that the plots show while the run lasts (s)."""
 PAUSE_S = 2.0
@@ -54,12 +64,14 @@ PAUSE_S = 2.0
 FLUSH_S = 30.0
 """Longest time that is waited for the view's last data to be written, s; rerun-sdk 0.41 would wait
 for ever where a disk is full."""
+STEEP = 0.7
+"""Share of the weight along the arm from which the arm is drawn upright or hanging, not lying."""
 EVENTS = "/events"
 """Entity of the text log."""
-LEGEND_TEXT = f"""- **white**: measured body
+LEGEND_TEXT = """- **white**: measured body
 - **red**: body that the model predicts
-- **points**: measured key points, {" to ".join(ERROR_NAMES)} from 0 to {LARGE_MM:g} mm of residual
-- **arrows**: error, from the measured to the predicted point, {STRETCH:g} times as long
+- **points**: measured key points, {colours} from 0 to {large:g} mm of residual, and beyond
+- **arrows**: error, from the measured to the predicted point, {stretch:g} times as long
 
 The alarm level begins when the reference of the change detector is complete.
 """
@@ -81,6 +93,27 @@ class LiveBench:
     """What runs on which rig."""
     tracks: bool
     """Whether a policy does a task, whose error is shown."""
+    error_mm: float | None = None
+    """Validated error of the model (mm); None where it is not known."""
+    gravity: tuple[float, ...] | None = None
+    """Direction of the weight in the arm's base frame; None: not known, z is drawn upward."""
+
+    @property
+    def large_mm(self) -> float:
+        """Residual at which the colour scale of the key points ends (mm)."""
+        return max(LARGE_MM, rounded_up(LARGE_TIMES * (self.error_mm or 0.0)))
+
+    @property
+    def stretch(self) -> float:
+        """Factor by which the drawn residual is magnified."""
+        return max(1.0, bar_length(STRETCH_OF_ERROR * self.length_mm / self.large_mm))
+
+    @property
+    def legend(self) -> str:
+        """What the colours mean, as Markdown."""
+        return LEGEND_TEXT.format(
+            colours=" to ".join(ERROR_NAMES), large=self.large_mm, stretch=self.stretch
+        )
 
 
 class LiveView:
@@ -108,7 +141,7 @@ class LiveView:
         self._lines("alarm/level", ["alarm level"], [REAL_COLOUR])
         self._lines("alarm/threshold", ["alarm"], [LIMIT_COLOUR], 1.0)
         self._lines("tracking/error", ["error"], [PLAN_COLOUR])
-        text = rr.TextDocument(LEGEND_TEXT, media_type="text/markdown")
+        text = rr.TextDocument(bench.legend, media_type="text/markdown")
         recording.log(LEGEND, text, static=True)
 
     def sample(
@@ -136,9 +169,9 @@ class LiveView:
         if known.sum() > 1:
             log("/body/measured", rr.LineStrips3D([_curve(measured_mm[known])]))
         if known.any():
-            colours = error_colours(size[known], LARGE_MM)
+            colours = error_colours(size[known], self.bench.large_mm)
             log("/body/points", rr.Points3D(measured_mm[known], colors=colours))
-            arrows = -STRETCH * residual[known]
+            arrows = -self.bench.stretch * residual[known]
             drawn = rr.Arrows3D(origins=measured_mm[known], vectors=arrows, colors=colours)
             log("/body/residual", drawn)
         log("/plots/pressure/measured", rr.Scalars(pressure))
@@ -169,7 +202,9 @@ class LiveView:
         """Show what happened at a time (s)."""
         self.recording.set_time(TIME, duration=t_s)
         level = "ERROR" if serious else "INFO"
-        self.recording.log(EVENTS, rr.TextLog(f"{t_s:6.1f} s  {text}", level=level))
+        for number, line in enumerate(textwrap.wrap(text, EVENT_COLUMNS)):
+            begin = f"{'':10}" if number else f"{t_s:6.1f} s  "
+            self.recording.log(EVENTS, rr.TextLog(begin + line, level=level))
 
     def _lines(self, place: str, names: list[str], colours: list, width: float = 1.6) -> None:
         style = rr.SeriesLines(names=names, colors=colours, widths=[width] * len(names))
@@ -183,6 +218,20 @@ def _curve(points_mm: np.ndarray) -> np.ndarray:
     return finer(kept, LINE_MM).astype(np.float32) if len(kept) > 1 else kept.astype(np.float32)
 
 
+def upright(gravity: Sequence[float] | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(3,) unit vectors of a view in the arm's base frame: to the right, away from the eye, up.
+
+    Up is against the weight, so that a hanging arm hangs; an arm along z that is held across the
+    weight lies to the right. gravity: direction of the weight; None: -z.
+    """
+    down = np.array([0.0, 0.0, -1.0]) if gravity is None else np.asarray(gravity, np.float64)
+    up = -down / np.linalg.norm(down)
+    side = np.array([1.0, 0.0, 0.0]) if abs(up[2]) > STEEP else np.array([0.0, 0.0, 1.0])
+    side = side - (side @ up) * up
+    side /= np.linalg.norm(side)
+    return side, np.cross(up, side), up
+
+
 def live_blueprint(bench: LiveBench, end_s: float | None = None) -> rrb.Blueprint:
     """The layout: bodies, events and colours beside plots.
 
@@ -191,14 +240,15 @@ def live_blueprint(bench: LiveBench, end_s: float | None = None) -> rrb.Blueprin
     """
     length = bench.length_mm
     middle = np.array([0.0, 0.0, 0.5 * length])
-    eye = middle + 1.45 * length * np.array([0.3, -0.85, 0.35])
+    side, into, up = upright(bench.gravity)
+    eye = middle + 1.45 * length * (0.3 * side - 0.85 * into + 0.35 * up)
     scene = rrb.Spatial3DView(
         origin="/",
         contents=["+ /body/**"],
-        name=f"{bench.title} (arrows x {STRETCH:g})",
+        name=f"{bench.title} (arrows x {bench.stretch:g})",
         background=rrb.Background(BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=True),
-        eye_controls=rrb.EyeControls3D(position=eye, look_target=middle, eye_up=(0.0, 0.0, 1.0)),
+        eye_controls=rrb.EyeControls3D(position=eye, look_target=middle, eye_up=up),
     )
     span = None
     if end_s is None:
@@ -216,7 +266,7 @@ def live_blueprint(bench: LiveBench, end_s: float | None = None) -> rrb.Blueprin
             axis_x=last_seconds(WINDOW_S) if end_s is None else time_axis(end_s),
         )
 
-    actuation = "Pressure" if bench.unit == "kPa" else "Actuation"
+    actuation = actuation_word(bench.unit).capitalize()
     plots = [
         plot("residual", "Residual of each key point (mm)", "righttop"),
         plot("alarm", "Alarm level (alarm at 1)", None),
@@ -224,7 +274,11 @@ def live_blueprint(bench: LiveBench, end_s: float | None = None) -> rrb.Blueprin
     ]
     if bench.tracks:
         plots.append(plot("tracking", "Error of the task (mm)", None))
-    right = rrb.Vertical(*plots, row_shares=[3, 2, 3, 2][: len(plots)])
+    shares = [3.0, 2.0, 3.0, 2.0][: len(plots)]
+    # Chambers come first in the legend, so that commands alone are cut where it is still too long.
+    needed = min(MOST_LEGEND, LEGEND_SHARE * 2 * bench.chambers)
+    shares[2] = max(3.0, needed / (1.0 - needed) * (sum(shares) - shares[2]))
+    right = rrb.Vertical(*plots, row_shares=shares)
     hidden = rrb.encodings.TimelineColumn(TIME, visible=False)
     shown = rrb.TextLogColumns(timeline_columns=[hidden], text_log_columns=["LogLevel", "Body"])
     below = rrb.Horizontal(

@@ -22,10 +22,14 @@ from typing import Any
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
-__all__ = ["AMBER", "BLUE", "CHART", "GREEN", "RED", "chart", "drawing"]
+__all__ = ["AMBER", "BLUE", "BROAD", "BROAD_PX", "CHART", "GREEN", "RED", "chart", "drawing"]
 
 CHART = (4.6, 3.0)
 """Size of a chart that is legible on a phone, inches."""
+BROAD = 11.0
+"""Width of a chart that fills a page on a screen, inches."""
+BROAD_PX = 760
+"""Width below which such a chart scrolls, because its text would be too small, pixels."""
 _STYLE: Any = {
     "axes.edgecolor": MUTED,
     "axes.facecolor": "none",
@@ -64,7 +68,7 @@ def drawing() -> Iterator[None]:
         yield
 
 
-def chart(figure: Figure, alt: str, caption: str = "") -> Picture:
+def chart(figure: Figure, alt: str, caption: str = "", least_px: int = 0) -> Picture:
     """Convert a figure drawn inside `drawing` to an SVG picture, and close the figure.
 
     Ink, muted and line colours become variables that follow the reader's theme. Draw scatter plots
@@ -77,4 +81,5 @@ def chart(figure: Figure, alt: str, caption: str = "") -> Picture:
     for colour, name in ((INK, "ink"), (MUTED, "muted"), (LINE, "line")):
         text = text.replace(colour, f"var(--{name})")
     head, tag, rest = text.partition("<defs>")
-    return Picture((head + _THEME + tag + rest).encode("utf-8"), alt, caption, "image/svg+xml")
+    data = (head + _THEME + tag + rest).encode("utf-8")
+    return Picture(data, alt, caption, "image/svg+xml", least_px)

@@ -20,6 +20,7 @@ from surgisoft.measurement.recordings.recording import left_out, usable_samples
 from surgisoft.progress import Progress, silent
 from surgisoft.rig.interface import Rig, Sample
 from surgisoft.rig.safety import SafeRig
+from surgisoft.units import actuation_word
 
 
 def collect(
@@ -190,7 +191,8 @@ def describe(
     usable = usable_samples(t_s, run_ids, measured, commanded)
     if not usable.any():
         raise InputError(
-            f"protocol '{protocol.name}': no sample has every pressure; are the sensors connected?"
+            f"protocol '{protocol.name}': no sample has every {actuation_word(rig.unit)}; are the "
+            "sensors connected?"
         )
     if not usable.all():
         warnings.warn(left_out(int((~usable).sum())), AssumptionWarning, stacklevel=2)

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import ArmInfo
+from surgisoft.units import actuation_word
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +134,7 @@ def checked_command(pressures: np.ndarray, limits: np.ndarray, unit: str) -> np.
     if pressures.shape != (len(limits),) or not np.isfinite(pressures).all():
         raise InputError(
             f"command has shape {pressures.shape} with values {pressures.tolist()}, "
-            f"expected {len(limits)} finite pressures in {unit}"
+            f"expected {len(limits)} finite {actuation_word(unit)}s in {unit}"
         )
     low, high = limits.T
     if (pressures < low - 1e-9).any() or (pressures > high + 1e-9).any():

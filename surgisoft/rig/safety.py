@@ -36,6 +36,7 @@ import numpy as np
 
 from surgisoft.errors import InputError, Terminated
 from surgisoft.rig.interface import Rig, Sample, close, is_simulated, vent, vented
+from surgisoft.units import actuation_word
 
 STOP_KEYS = (b" ", b"\x1b")
 """Keys of the emergency stop: the space bar and Esc."""
@@ -103,7 +104,7 @@ class SafeRig:
         if own.shape != (rig.chambers, 2) or not np.isfinite(own).all():
             raise InputError(
                 f"the rig's limits are {own.tolist()}, expected {rig.chambers} finite pairs of the "
-                "lowest and the highest pressure"
+                f"lowest and the highest {actuation_word(self.unit)}"
             )
         self.limits = np.clip(own, self.safety.lowest, self.safety.highest)
         if not (self.limits[:, 0] < self.limits[:, 1]).all():
@@ -159,8 +160,8 @@ class SafeRig:
         given = np.asarray(pressures, np.float64)
         if given.shape != (self.chambers,):
             raise InputError(
-                f"command has shape {given.shape}, expected {self.chambers} pressures in "
-                f"{self.unit}"
+                f"command has shape {given.shape}, expected {self.chambers} "
+                f"{actuation_word(self.unit)}s in {self.unit}"
             )
         self._armed = True
         self._called = self._clock()
@@ -389,10 +390,9 @@ class SafeRig:
             self._seen_s = self._commanded_s = now
         self._time_s = now
         silent = ~np.isfinite(np.asarray(sample.measured, np.float64))
+        what = actuation_word(self.unit)
         if np.shape(sample.measured) != (self.chambers,):
-            self._stop(
-                f"a sample has {np.size(sample.measured)} pressures, expected {self.chambers}"
-            )
+            self._stop(f"a sample has {np.size(sample.measured)} {what}s, expected {self.chambers}")
         if np.shape(sample.key_points_mm) != (self.key_planes, 3):
             self._stop(
                 f"a sample has key points of shape {np.shape(sample.key_points_mm)}, expected "
@@ -401,7 +401,7 @@ class SafeRig:
         if not np.isfinite(sample.key_points_mm).any():
             self._blind = "no key point was seen"
         elif silent.any():
-            self._blind = f"the pressure sensor of chamber {int(silent.argmax()) + 1} was silent"
+            self._blind = f"the {what} sensor of chamber {int(silent.argmax()) + 1} was silent"
         else:
             self._seen_s = now
         if self._is_blind(self.safety.vent_ms):

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor, nn
 
 from surgisoft.errors import InputError
-from surgisoft.files import new_folder, read_json, write_json
+from surgisoft.files import check_export_folder, new_folder, read_json, write_json
 from surgisoft.graphs import (
     Call,
     DoesNotTrace,
@@ -46,6 +46,7 @@ from surgisoft.surrogate.effects import EFFECTS, Context, Effect
 from surgisoft.surrogate.effects.user_defined import kind_of
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import AWAY_SHARE, ArmModel
+from surgisoft.units import actuation_word
 
 FORMAT = 1
 """Version of `arm.json`."""
@@ -182,7 +183,10 @@ class _Start(nn.Module):
 
 
 def export_arm(
-    model: ArmModel, folder: str | Path, recordings: Mapping[str, History] | None = None
+    model: ArmModel,
+    folder: str | Path,
+    recordings: Mapping[str, History] | None = None,
+    force: bool = False,
 ) -> list[Path]:
     """Write an arm model for other programs; returns the files.
 
@@ -190,11 +194,11 @@ def export_arm(
     TorchScript and ONNX. recordings: by their names; the files are also compared with the model
     over every row of each, and `arm.json` has the largest difference of a coordinate in mm under
     `recordings`. Raises InputError where the folder is in use, where an effect of the model cannot
-    be written, and where a difference is larger than `TOLERANCE_MM`.
+    be written, and where a difference is larger than `TOLERANCE_MM`. force: replace an earlier
+    export of an arm model.
     """
     folder = Path(folder)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: already exists; choose another name")
+    check_export_folder(folder, "arm.json", force)
     try:
         graph = ArmGraph(model)
         for name, effect in graph.model.effects.items():
@@ -202,7 +206,7 @@ def export_arm(
                 _check_effect(name, effect, graph)
         called = isinstance(graph.model.network, CallableNetwork)
         write, files = (_write_code, CALLABLE_FILES) if called else (_write, FILES)
-        with new_folder(folder) as fresh:
+        with new_folder(folder, [*FILES, *CALLABLE_FILES]) as fresh:
             worst, over = write(graph, fresh, recordings or {})
             about = describe_arm(graph, worst)
             write_json(fresh / "arm.json", about | ({"recordings": over} if over else {}))
@@ -275,9 +279,9 @@ def describe_arm(graph: ArmGraph, worst_mm: float) -> dict[str, Any]:
         **files,
         "start": start,
         "step": step,
-        "start_meaning": "pressure (1, m) at which a run begins; an arm that begins away from rest "
-        f"by more than {AWAY_SHARE:.0%} of a range is assumed to have been held there for "
-        f"{STOOD_S:g} s, any other one to be at rest without a past",
+        "start_meaning": f"{actuation_word(spec.unit)} (1, m) at which a run begins; an arm that "
+        f"begins away from rest by more than {AWAY_SHARE:.0%} of a range is assumed to have been "
+        f"held there for {STOOD_S:g} s, any other one to be at rest without a past",
         "recording_columns": [
             f"{'c' if spec.actuation == 'commanded' else 'p'}{number}_{spec.unit}"
             for number in range(1, spec.chambers + 1)

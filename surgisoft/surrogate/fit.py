@@ -118,7 +118,7 @@ class ChamberExcitation:
             why = f"it {often}"
         elif self.contrast < LEAST_CONTRAST:
             why = (
-                "its direction follows from the pressures themselves "
+                "its direction follows from the actuation itself "
                 f"(contrast {self.contrast:.2f}, at least {LEAST_CONTRAST} needed)"
             )
         else:

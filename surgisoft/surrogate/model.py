@@ -26,6 +26,7 @@ from surgisoft.surrogate.networks import (
     RecurrentArm,
 )
 from surgisoft.surrogate.training_residuals import PAST_ROWS, ROWS, Past, TrainingResiduals
+from surgisoft.units import actuation_word
 
 AWAY_SHARE = 0.15
 """A run begins away from rest where a chamber's measured actuation is farther from it than this
@@ -355,7 +356,7 @@ class ArmModel(nn.Module):
 
     def summary(self) -> str:
         """One line of text: inputs, network and effects."""
-        inputs = "pressure+direction" if self.network.directions else "pressure"
+        inputs = actuation_word(self.spec.unit) + "+direction" * self.network.directions
         effects = " + ".join(self.effects) or "none"
         kind = type(self.network).__name__
         if isinstance(self.network, HawEnsemble):

@@ -122,7 +122,8 @@ def names(folder):
 def test_ctrl_c_during_the_work_leaves_nothing(command, bench, monkeypatch, capsys):
     monkeypatch.chdir(bench)
     before = names(bench)
-    monkeypatch.setattr(surgisoft.cli.progress.Pace, "__call__", interrupt)
+    for told in ("__call__", "step"):
+        monkeypatch.setattr(surgisoft.cli.progress.Report, told, interrupt)
     assert run(COMMANDS[command].split()) == 130
     said = capsys.readouterr().err.splitlines()
     assert said[-1] == "surgisoft: interrupted; no output was written"
@@ -171,7 +172,9 @@ def test_ctrl_c_in_a_later_stage_of_a_fit_keeps_the_finished_stages(
     bench, tmp_path, monkeypatch, capsys
 ):
     command = f"fit {bench / 'rec.csv'} --effects hysteresis --epochs 40 --widths 8 -o NEW"
-    _, error = interrupted(command, "hysteresis: held-out", tmp_path, monkeypatch, capsys)
+    _, error = interrupted(
+        command, r"\(hysteresis\), \d+ of \d+: held-out", tmp_path, monkeypatch, capsys
+    )
     report = json.loads((tmp_path / "NEW" / "report.json").read_text())
     assert report["interrupted"]["stage"] == "hysteresis"
     assert report["interrupted"]["finished"] == ["pressure"]

@@ -15,7 +15,9 @@ from surgisoft.agents.training import Result
 from surgisoft.cli import run
 from surgisoft.cli.diagnose import announced
 from surgisoft.cli.fit import above_noise
+from surgisoft.diagnosis.design.next_experiment import Experiment
 from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Ranked, Verdict
+from surgisoft.diagnosis.error_axes import AxisShare
 from surgisoft.diagnosis.residuals import ModelFit
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import Recording, save_recording
@@ -50,9 +52,9 @@ def printed(capsys, monkeypatch, target: str, found, *command: str, code: int = 
 
 
 AXES = (
-    SimpleNamespace(axis="pressure", share=0.5, ci95=(0.4, 0.6), static=True),
-    SimpleNamespace(axis="speed", share=0.3, ci95=(0.2, 0.4), static=False),
-    SimpleNamespace(axis="room", share=0.01, ci95=(0.0, 0.02), static=True),
+    AxisShare("pressure", "actuation itself", "kPa", 0.5, (0.4, 0.6), True),
+    AxisShare("speed", "", "kPa/s", 0.3, (0.2, 0.4), False),
+    AxisShare("room", "", "", 0.01, (0.0, 0.02), True),
 )
 
 
@@ -238,7 +240,7 @@ def test_diagnose_prints_candidates_and_the_next_step(bench, capsys, monkeypatch
         reason="a lag is close", candidates=[tried],
         not_tried=[("leak", "steady-state samples"), ("twist", "named already")],
     )  # fmt: skip
-    plan = SimpleNamespace(name="ramps", minutes=5.0, separates=[("creep", "leak")])
+    plan = Experiment("ramps", 5.0, (("creep", "leak"),))
     found = diagnosis(
         verdict=SimpleNamespace(kind="ambiguous", sentence="creep or leak"), refit=refit,
         shown=[row], checks=("the clock is even",), next_experiment=plan,

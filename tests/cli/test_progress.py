@@ -3,6 +3,7 @@
 import io
 import re
 import sys
+import time
 from datetime import datetime
 
 import surgisoft.cli.progress as under_test
@@ -80,6 +81,28 @@ def test_without_a_terminal_occasional_lines_state_the_time_left(capsys, monkeyp
         r"surgisoft: evaluate scripted: 67%, playing, \S+ %/s, \d+ s left, ends \d\d:\d\d", lines[2]
     )
     assert lines[3] == "surgisoft: evaluate scripted: 100%, playing"
+
+
+def test_work_that_reports_nothing_is_told_again(capsys, monkeypatch):
+    monkeypatch.setattr(under_test, "LINE_EVERY_S", 0.05)
+    monkeypatch.setattr(under_test, "SHORTEST_WAIT_S", 0.05)
+    with progress("diagnose") as report:
+        report.step(4, 6, "held-out errors")
+        time.sleep(0.4)
+    time.sleep(0.2)
+    lines = capsys.readouterr().err.splitlines()
+    assert 2 <= len(lines) <= 8
+    assert {line.rsplit(",", 1)[0] for line in lines} == {"surgisoft: diagnose: held-out errors"}
+
+
+def test_steps_of_unlike_times_tell_no_end(capsys, monkeypatch):
+    monkeypatch.setattr(under_test, "LINE_EVERY_S", 0.0)
+    with progress("improve") as report:
+        report.step(1, 4, "creep")
+        time.sleep(0.01)
+        report.step(3, 4, "payload")
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == [f"surgisoft: improve: {name}, 0 s so far" for name in ("creep", "payload")]
 
 
 class Terminal(io.StringIO):

@@ -1,5 +1,7 @@
 """Residuals of known cause depend most on the axis that physics says."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -15,7 +17,9 @@ from surgisoft.diagnosis.error_axes import (
     lag,
     shares,
 )
+from surgisoft.diagnosis.pages.compare import compare_page
 from surgisoft.diagnosis.residuals import problem_of, residual_table
+from surgisoft.report.page import render
 from tests.diagnosis.synthetic import (
     POINTS,
     backlash,
@@ -225,3 +229,23 @@ def test_a_diagnosis_names_an_axis_that_is_clear(monkeypatch, share, low, named)
     assert result.axis == ("pressure" if named else None)
     more = "; the error depends most on pressure (30 %)" if named else ""
     assert result.verdict.sentence == "the cause is unknown" + more
+
+
+@pytest.mark.parametrize(("unit", "word"), [("ml", "actuation"), ("bar", "pressure")])
+def test_only_pressures_are_called_pressure(unit, word):
+    """Volumes of syringes in ml are none: in the sentence, in the summary of the model and in all
+    charts and tables of the page. Only fields for programs keep their name."""
+    moved = walk(600)
+    made = replace(recording(0.3 * (moved[:, 0] - 5), moved), unit=unit)
+    model = still_model()
+    model = model.replace(spec=replace(model.spec, unit=unit)).eval()
+    result, table = compare(model, made)
+    assert result.axes[0].axis == "pressure"
+    assert f"it depends most on {word} (" in result.sentence
+    assert f"({word})" in model.summary()
+    page = compare_page(result, table, "two segments", model.summary())
+    text = render(page)
+    other = {"actuation": "pressure", "pressure": "actuation"}[word]
+    assert f"what {word} explains of the error" in text
+    assert f"{other} [{unit}]" not in text
+    assert word == "pressure" or "pressure" not in text

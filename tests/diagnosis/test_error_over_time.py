@@ -1,11 +1,15 @@
-"""The picture of the error over time, where motion capture is slower than the log."""
+"""Pictures: the error over time where motion capture is slower than the log, many chambers, and
+charts that fill a page."""
 
 from types import SimpleNamespace
 
 import matplotlib.pyplot as plt
 import numpy as np
+import pytest
 
-from surgisoft.diagnosis.pages.pictures import error_over_time
+from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Verdict
+from surgisoft.diagnosis.pages.diagnosis import effects_chart
+from surgisoft.diagnosis.pages.pictures import error_over_time, loops
 
 
 def test_rows_that_lack_a_key_point_do_not_pull_the_mean_down():
@@ -24,3 +28,39 @@ def test_rows_that_lack_a_key_point_do_not_pull_the_mean_down():
     np.testing.assert_allclose(tip.get_ydata(), 4.0)
     np.testing.assert_array_equal(mean.get_xdata(), np.arange(0, 40, 2))
     plt.close(figure)
+
+
+@pytest.mark.parametrize("chambers", [1, 3, 4, 6, 8])
+def test_the_loops_of_many_chambers_keep_their_size(chambers):
+    """A page shows a picture at most 11 inches wide at its own size; a wider one is shrunk."""
+    rng = np.random.default_rng(1)
+    points = np.zeros((200, 2, 3))
+    points[:, -1, 0] = np.linspace(0, 30, 200)
+    table = SimpleNamespace(
+        pressure=rng.uniform(0, 10, (200, chambers)).cumsum(0),
+        measured_mm=points,
+        predicted_mm=points + 1.0,
+        run=np.zeros(200, int),
+    )
+    figure = loops(table, "ml")
+    figure.canvas.draw()
+    wide, high = figure.get_size_inches()
+    assert wide <= 11.0
+    drawn = [axis for axis in figure.axes if axis.lines]
+    of = [f"chamber {number} [ml]" for number in range(1, chambers + 1)]
+    assert sorted(axis.get_xlabel() for axis in drawn) == sorted(2 * of)
+    for axis in drawn:
+        box = axis.get_position()
+        assert box.width * wide > 1.8
+        assert box.height * high > 1.5
+    assert all(not axis.axison for axis in figure.axes if not axis.lines)
+    plt.close(figure)
+
+
+def test_the_chart_of_effects_fills_the_page():
+    """The page is 1072 px wide inside its margins, and an inch is 96 px."""
+    found = Diagnosis(Verdict("unknown_effect", (), "unknown"), ErrorLevels(1.0, 0.1, 0.5), ())
+    picture = effects_chart(found)
+    wide_pt = float(picture.data.split(b'width="', 1)[1].split(b"pt", 1)[0])
+    assert 0.9 * 1072 < wide_pt / 72 * 96 <= 1072
+    assert picture.least_px >= 600

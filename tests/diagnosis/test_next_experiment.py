@@ -13,6 +13,7 @@ from surgisoft.cli import run
 from surgisoft.diagnosis.design import next_experiment as designing
 from surgisoft.diagnosis.design.isolability import Isolability, isolability
 from surgisoft.diagnosis.design.next_experiment import (
+    Experiment,
     Pair,
     Plan,
     Recommendation,
@@ -427,3 +428,17 @@ def test_effects_compete_from_half_of_the_evidence_of_the_best_on(monkeypatch, g
     posed = SimpleNamespace(owners=owners, gains=np.array(values))
     monkeypatch.setattr(designing, "pose_question", lambda *given, **more: posed)
     assert likely_competing(SimpleNamespace(model=None)) == rivals
+
+
+@pytest.mark.parametrize(
+    ("pairs", "said"),
+    [
+        (
+            (("creep", "leak"), ("creep", "drift")),
+            "distinguishes creep from leak, creep from drift",
+        ),
+        ((), "is not sure to distinguish any two of the competing effects"),
+    ],
+)
+def test_an_experiment_says_what_it_distinguishes(pairs, said):
+    assert said in Experiment("ramps", 5.0, pairs).in_words

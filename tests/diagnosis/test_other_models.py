@@ -1,5 +1,8 @@
 """Callables and files of predictions in a diagnosis: they agree with the arm behind them."""
 
+import re
+import time
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -18,11 +21,12 @@ from surgisoft.diagnosis.other_models import (
 from surgisoft.diagnosis.residuals import residual_table
 from surgisoft.diagnosis.setup import find_setup_faults
 from surgisoft.diagnosis.testability import testable as split_by_testability
-from surgisoft.errors import InputError
+from surgisoft.errors import AssumptionWarning, InputError
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import Recording, with_predictions
 from surgisoft.rig import VirtualRig
+from surgisoft.surrogate.callables import network
 from surgisoft.surrogate.callables.named import given_callable
 from surgisoft.surrogate.checkpoint import default_arm
 from surgisoft.surrogate.effects import make_effect
@@ -167,6 +171,32 @@ def test_the_validated_error_comes_from_before(loaded):
     assert callable_arm(given_callable(off), [loaded]).validation.rmse_mm is None
     stated = callable_arm(given_callable(off), [loaded], [before], error_mm=0.5)
     assert stated.validation.per_key_point_mm == (0.5,) * 5
+
+
+@pytest.mark.parametrize("static", [False, True])
+def test_a_slow_callable_is_told_once_with_what_it_will_take(static, loaded, monkeypatch):
+    class Slow:
+        def __call__(self, time_s, actuation):
+            time.sleep(0.0 if len(actuation) == 1 else 0.25)
+            return np.zeros((len(actuation), 5, 3))
+
+    def told(model):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            residual_table(open_model(model, loaded).model, [loaded])
+            residual_table(open_model(model, loaded).model, [loaded])
+        return [str(each.message) for each in caught if each.category is AssumptionWarning]
+
+    slow = Slow()
+    slow.static = static
+    assert told(slow) == []
+    monkeypatch.setattr(network, "SLOW_S", 0.25)
+    monkeypatch.setattr(network, "EVALUATIONS", 720)
+    first, second = told(slow)
+    assert first.split(" took ")[0] == second.split(" took ")[0]
+    assert f"for {len(loaded.t_s)} rows" in first
+    # 720 evaluations of 0.25 s are 3 min; a busy machine may take longer.
+    assert 3 <= int(re.search(r"may take (\d+) min", first)[1]) < 60
 
 
 def test_rows_are_matched_by_their_times(loaded, with_file, tmp_path):

@@ -346,9 +346,7 @@ def test_why_a_chamber_supports_no_memory():
     )
     assert few.unsupported() == "chamber 1: it reversed only 1 time"
     assert replace(few, reversals=0).unsupported() == "chamber 1: it never reversed"
-    assert (
-        "its direction follows from the pressures themselves (contrast 0.00" in same.unsupported()
-    )
+    assert "its direction follows from the actuation itself (contrast 0.00" in same.unsupported()
     assert ends.unsupported() not in ("", few.unsupported())
     assert good.unsupported() == ""
     two = pack([torch.arange(2.0)], [torch.tensor([[0.0], [5.0]])], [torch.zeros(2, 1, 3)])

@@ -556,6 +556,16 @@ class Experiment:
     separates: tuple[tuple[str, str], ...]
     """Pairs of effects that it tells apart."""
 
+    @property
+    def in_words(self) -> str:
+        """What it distinguishes."""
+        if not self.separates:
+            return (
+                "is the best of those that were tried, but is not sure to distinguish any two of "
+                "the competing effects"
+            )
+        return "distinguishes " + ", ".join(" from ".join(pair) for pair in self.separates)
+
 
 MINUTES = 15.0
 """Longest time on the bench where none is asked for, minutes."""

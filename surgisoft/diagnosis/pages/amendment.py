@@ -2,13 +2,13 @@
 
 import inspect
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from surgisoft.diagnosis.amend import Amendment, Fall, Track, errs_more
 from surgisoft.diagnosis.diagnose import Diagnosis
+from surgisoft.diagnosis.error_axes import axis_in_words
 from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
 from surgisoft.diagnosis.improve import NETWORK, Improvement, Round
 from surgisoft.diagnosis.pages.pictures import bodies, save
@@ -27,7 +27,7 @@ from surgisoft.report import (
     Text,
     write_page,
 )
-from surgisoft.report.charts import BLUE, GREEN, RED, chart, drawing
+from surgisoft.report.charts import BLUE, BROAD, BROAD_PX, GREEN, RED, chart, drawing
 from surgisoft.report.style import MUTED
 from surgisoft.surrogate.effects import known_effects
 from surgisoft.surrogate.effects.user_defined import kind_of
@@ -155,10 +155,6 @@ def parameter_table(parameters: tuple[Parameter, ...]) -> Table:
     return Table(header, rows)
 
 
-BROAD_PX = 560
-"""Width below which a chart over time scrolls, pixels."""
-
-
 def track_charts(tracks: dict[str, Track], floor_mm: float) -> list[Picture]:
     """A chart of each track by its caption, all with one scale of the error.
 
@@ -171,7 +167,7 @@ def track_charts(tracks: dict[str, Track], floor_mm: float) -> list[Picture]:
     pictures = []
     with drawing():
         for caption, (time_s, before, after) in thinned.items():
-            figure, axis = plt.subplots(figsize=(7.2, 2.8))
+            figure, axis = plt.subplots(figsize=(BROAD, 3.0))
             for values, colour, label in ((before, RED, "before"), (after, BLUE, "after")):
                 axis.plot(*with_gaps(time_s, values), c=colour, lw=1, label=label)
             axis.axhline(floor_mm, c=MUTED, lw=0.8, ls="--", label="noise floor")
@@ -179,7 +175,7 @@ def track_charts(tracks: dict[str, Track], floor_mm: float) -> list[Picture]:
             axis.set_ylabel("error [mm]")
             axis.set_ylim(0, 1.05 * most)
             figure.legend(loc="outside lower center", ncols=3)
-            pictures.append(replace(chart(figure, caption, caption), least_px=BROAD_PX))
+            pictures.append(chart(figure, caption, caption, BROAD_PX))
     return pictures
 
 
@@ -394,7 +390,8 @@ def what_is_left(result: Improvement, command: str = "") -> Section:
     if result.interrupted:  # the last diagnosis may be that of an earlier model
         return Section("What is left", parts)
     if last.axis:
-        parts.append(Text(f"The remaining error depends most on {last.axis}."))
+        called = axis_in_words(last.axis, result.model.spec.unit)
+        parts.append(Text(f"The remaining error depends most on {called}."))
     wrong = [each for each in result.parameters if not each.plausible]
     if wrong:
         names = ", ".join(f"{each.name} of {each.effect}" for each in wrong)
@@ -405,8 +402,7 @@ def what_is_left(result: Improvement, command: str = "") -> Section:
         parts.append(Text(text))
     if last.next_experiment:
         plan = last.next_experiment
-        pairs = ", ".join(" from ".join(pair) for pair in plan.separates) or "none for certain"
-        text = f"Record next: {plan.name}, {plan.minutes:g} minutes; it distinguishes {pairs}."
+        text = f"Record next: {plan.name}, {plan.minutes:g} minutes; it {plan.in_words}."
         parts.append(Text(text))
     # What was added since BEFORE is no part of a model that is to describe BEFORE better.
     done = result.steps and any(word in last.next_command for word in ("amend", "{earlier}"))

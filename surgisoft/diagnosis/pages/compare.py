@@ -9,7 +9,15 @@ import numpy as np
 
 from surgisoft.diagnosis.body_frame import COMPONENTS
 from surgisoft.diagnosis.compare import Compared, Comparison
-from surgisoft.diagnosis.error_axes import AXES, NAMES, AxisShare, Band, Profile, arc_length
+from surgisoft.diagnosis.error_axes import (
+    AXES,
+    NAMES,
+    AxisShare,
+    Band,
+    Profile,
+    arc_length,
+    axis_in_words,
+)
 from surgisoft.diagnosis.pages.pictures import bodies, draw_all, mark_recordings, save
 from surgisoft.diagnosis.residuals import ResidualTable
 from surgisoft.palette import model_colour
@@ -50,7 +58,7 @@ HOW = (
     "noise floor may be noise, or more than could be learned from these recordings."
 )
 PICTURES = {
-    "loops": "Tip against actuation, measured and predicted; below, without what pressure explains",
+    "loops": "Tip against actuation, measured and predicted; below, less what actuation explains",
     "body": "The whole body in a few postures, with magnified errors",
     "error": "The error over time",
 }
@@ -137,7 +145,7 @@ def _facts(result: Comparison) -> Facts:
 def _depends(result: Comparison, table: ResidualTable) -> Section:
     rows = [
         (
-            each.axis,
+            each.in_words,
             Share(each.share),
             _span(tuple(100 * value for value in each.ci95), "{:.0f}"),
             "alone" if each.static else "beyond actuation",
@@ -232,14 +240,14 @@ def share_chart(share: AxisShare, floor_mm: float | None) -> Picture:
     figure, (top, low) = plt.subplots(2, 1, figsize=(CHART[0], 1.5 * CHART[1]), sharex=not many)
     before = "error" if share.static else "error beyond actuation"
     top.plot(main.middle, main.without_mm, ".-", c=RED, lw=1.2, ms=4, label=before)
-    label = f"left with {share.axis}"
+    label = f"left with {share.in_words}"
     top.plot(main.middle, main.left_mm, ".-", c=BLUE, lw=1.2, ms=4, label=label)
     top.fill_between(main.middle, main.left_mm, main.without_mm, color=RED, alpha=0.15, lw=0)
     if floor_mm is not None:
         top.axhline(floor_mm, c=MUTED, lw=0.8, ls=":", label="floor")
     top.set_ylim(bottom=0)
     of = f" ({_of_chamber(main)})" if many else ""
-    top.set_title(f"{share.axis}: explains {100 * share.share:.0f} %{of}")
+    top.set_title(f"{share.in_words}: explains {100 * share.share:.0f} %{of}")
     top.set_ylabel("error [mm]")
     for number, profile in enumerate(profiles):
         colour = CHAMBERS[number % len(CHAMBERS)] if many else GREEN
@@ -253,9 +261,9 @@ def share_chart(share: AxisShare, floor_mm: float | None) -> Picture:
     for panel in (top, low):
         if share.axis == "direction":
             panel.set_xticks([-1, 0, 1], ["falling", "", "rising"])
-    low.set_xlabel(f"{share.axis} [{share.unit}]" if share.unit else share.axis)
+    low.set_xlabel(f"{share.in_words} [{share.unit}]" if share.unit else share.in_words)
     figure.legend(loc="outside lower center", ncols=3, fontsize=8)
-    return chart(figure, f"what {share.axis} explains of the error")
+    return chart(figure, f"what {share.in_words} explains of the error")
 
 
 def _won(profile: Profile) -> float:
@@ -289,21 +297,23 @@ def _chart(result: Comparison, axis: str, unit: str) -> Picture:
         top.axhline(result.floor.rmse_mm, c=MUTED, lw=0.8, ls=":", label="floor")
     low.axhline(0.0, c=MUTED, lw=0.8)
     top.set_ylim(bottom=0)
-    top.set_title(_title(result, axis))
+    top.set_title(_title(result, axis, unit))
     top.set_ylabel("error [mm]")
     low.set_ylabel("bias [mm]" if len(found) == 1 else "bias in plane [mm]")
     if axis == "direction":
         low.set_xticks([-1, 1], ["falling", "rising"])
-    low.set_xlabel(f"{axis} [{unit}]" if unit else axis)
+    called = axis_in_words(axis, unit)
+    low.set_xlabel(f"{called} [{unit}]" if unit else called)
     for panel in (top, low):
         if panel.get_legend_handles_labels()[1]:
             panel.legend(fontsize=8, ncols=2)
-    return chart(figure, f"error and bias over {axis}")
+    return chart(figure, f"error and bias over {called}")
 
 
-def _title(result: Comparison, axis: str) -> str:
+def _title(result: Comparison, axis: str, unit: str) -> str:
     share = next((each for each in result.axes if each.axis == axis), None)
-    return axis if share is None else f"{axis}: explains {100 * share.share:.0f} %"
+    called = axis_in_words(axis, unit)
+    return called if share is None else f"{called}: explains {100 * share.share:.0f} %"
 
 
 def _line(panel, bands: list[Band], values, spread, colour, label) -> None:
@@ -355,7 +365,7 @@ def together_page(compared: Sequence[Compared], title: str, drawn: Sequence[Path
             f"{_span(one.result.rmse_ci95_mm)} mm",
             _mm(one.result.tip_rmse_mm),
             "-" if one.result.explainable is None else f"{100 * one.result.explainable:.0f} %",
-            ", ".join(each.axis for each in one.result.main_axes) or "no single axis",
+            ", ".join(each.in_words for each in one.result.main_axes) or "no single axis",
             f"{number}/report.html",
         )
         for number, one in enumerate(compared, 1)
@@ -472,9 +482,10 @@ def _models_over(compared: Sequence[Compared], name: str) -> Picture:
             _line(axis, bands, values, spread, model_colour(number), one.name)
     axis.set_ylim(bottom=0)
     chamber = column.split()[-1].removeprefix("p")
-    title = f"{name} of chamber {chamber}" if chamber.isdigit() and len(first) > 1 else name
+    called = axis_in_words(name, unit)
+    title = f"{called} of chamber {chamber}" if chamber.isdigit() and len(first) > 1 else called
     axis.set_title(title)
-    axis.set_xlabel(f"{name} [{unit}]" if unit else name)
+    axis.set_xlabel(f"{called} [{unit}]" if unit else called)
     axis.set_ylabel("error [mm]")
     figure.legend(loc="outside lower center", ncols=3, fontsize=8)
-    return chart(figure, f"error of each model over {name}")
+    return chart(figure, f"error of each model over {called}")

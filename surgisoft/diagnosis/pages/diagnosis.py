@@ -110,16 +110,10 @@ def diagnosis_page(found: Diagnosis, title: str, command: str = "") -> Page:
         parts.append(_refit(found.refit))
     if found.next_experiment:
         plan = found.next_experiment
-        pairs = ", ".join(" from ".join(pair) for pair in plan.separates) or "none for certain"
         parts.append(
             Section(
                 "Next experiment",
-                [
-                    Text(
-                        f"{plan.name}: {plan.minutes:g} minutes on the bench; "
-                        f"distinguishes {pairs}."
-                    )
-                ],
+                [Text(f"{plan.name}: {plan.minutes:g} minutes on the bench; {plan.in_words}.")],
             )
         )
     if verdict.effects:
@@ -179,14 +173,24 @@ def change_chart(track: ChangeTrack, name: str):
 
     name: what the explained change is explained by.
     """
-    from surgisoft.report.charts import AMBER, BLUE, GREEN, RED, chart, drawing, plt
+    from surgisoft.report.charts import (
+        AMBER,
+        BLUE,
+        BROAD,
+        BROAD_PX,
+        GREEN,
+        RED,
+        chart,
+        drawing,
+        plt,
+    )
 
     rows = worst_stretch(track)
     change = track.change_mm[rows, -1]
     along = np.linalg.svd(np.nan_to_num(change), full_matrices=False)[2][0]
     time = track.t_s[rows]
     with drawing():
-        figure, (top, below) = plt.subplots(2, 1, figsize=(7.2, 4.6), sharex=True)
+        figure, (top, below) = plt.subplots(2, 1, figsize=(BROAD, 5.0), sharex=True)
         rest = np.nanmean(track.before_mm[:, -1], axis=0)
         for points, colour, label in (
             (track.before_mm, BLUE, "before"),
@@ -204,10 +208,10 @@ def change_chart(track: ChangeTrack, name: str):
         top.set_ylabel("tip [mm]")
         below.set_ylabel("change of the tip [mm]")
         below.set_xlabel("time [s]")
-        top.legend(fontsize=7)
-        below.legend(fontsize=7)
+        top.legend(fontsize=8)
+        below.legend(fontsize=8)
         caption = "Tip before and after where it changes most, along the main direction of change"
-        return chart(figure, caption, caption)
+        return chart(figure, caption, caption, BROAD_PX)
 
 
 def worst_stretch(track: ChangeTrack) -> np.ndarray:
@@ -341,13 +345,23 @@ def _number(value) -> str:
 
 def effects_chart(found: Diagnosis):
     """Held-out error with each effect, between the noise floor and what is left without any."""
-    from surgisoft.report.charts import AMBER, BLUE, GREEN, RED, chart, drawing, plt
+    from surgisoft.report.charts import (
+        AMBER,
+        BLUE,
+        BROAD,
+        BROAD_PX,
+        GREEN,
+        RED,
+        chart,
+        drawing,
+        plt,
+    )
 
     rows = found.shown[::-1]
     error, paired = found.error_mm, found.track is not None
     what, blocks = "change" if paired else "error", "left-out" if found.in_fit else "held-out"
     with drawing():
-        figure, axis = plt.subplots(figsize=(4.8, 0.6 + 0.24 * max(len(rows), 3)))
+        figure, axis = plt.subplots(figsize=(BROAD, 0.8 + 0.26 * max(len(rows), 3)))
         for place, row in enumerate(rows):
             named = row.effect in found.verdict.effects
             low, high = row.ci95
@@ -363,19 +377,29 @@ def effects_chart(found: Diagnosis):
         left = "change left" if paired else "error"
         axis.set_xlabel(f"{blocks} {left} with this effect added [mm]")
         axis.set_xlim(left=0)
-        figure.legend(fontsize=8, loc="outside upper center", ncols=2)
-        return chart(figure, f"{blocks.capitalize()} {what} with each effect")
+        figure.legend(fontsize=8, loc="outside upper center", ncols=3)
+        return chart(figure, f"{blocks.capitalize()} {what} with each effect", "", BROAD_PX)
 
 
 def along_chart(found: Diagnosis):
     """Error, or change, of each block of time; the worst one marked where the error is local."""
-    from surgisoft.report.charts import AMBER, BLUE, GREEN, RED, chart, drawing, plt
+    from surgisoft.report.charts import (
+        AMBER,
+        BLUE,
+        BROAD,
+        BROAD_PX,
+        GREEN,
+        RED,
+        chart,
+        drawing,
+        plt,
+    )
 
     along, paired = found.along, found.track is not None
     assert along is not None
     what = "change" if paired else "error"
     with drawing():
-        figure, axis = plt.subplots(figsize=(7.2, 2.2))
+        figure, axis = plt.subplots(figsize=(BROAD, 2.6))
         for begin, end, value, far in zip(
             along.from_s, along.to_s, along.rmse_mm, along.local, strict=True
         ):
@@ -386,11 +410,11 @@ def along_chart(found: Diagnosis):
         axis.set_ylim(bottom=0)
         axis.set_xlabel("time [s]")
         axis.set_ylabel(f"RMS {what} [mm]")
-        axis.legend(fontsize=7)
+        axis.legend(fontsize=8)
         caption = f"RMS {what} of each block of time"
         if any(along.local):
             caption += f"; red: more than {LOCAL:g} times the median"
-        return chart(figure, caption, caption)
+        return chart(figure, caption, caption, BROAD_PX)
 
 
 def write_report(found: Diagnosis, folder: Path, title: str, command: str = "") -> Path:

@@ -22,6 +22,10 @@ LOOP_ROWS = 160
 """Most rows that one picture of loops shows; more would hide each other."""
 LADDER_ROWS = 400
 """Rows of the ladder's picture, in which one chamber moves alone."""
+LOOPS_ABREAST = 3
+"""Most chambers whose loops stand side by side: with more, a page shows their text too small."""
+LOOPS_IN, LOOPS_HIGH_IN = 3.2, 2.5
+"""Width and height of the loops of one chamber, inches."""
 POSTURES = 7
 """Bodies that the picture in space shows."""
 MOST_TICKS = 5
@@ -106,11 +110,18 @@ def loops(table: ResidualTable, unit: str, title: str = ""):
     best polynomial in all pressures is taken out of both: what is left has memory, or noise.
     """
     chambers = table.pressure.shape[1]
+    bands = -(-chambers // LOOPS_ABREAST)
+    abreast = -(-chambers // bands)
+    size = (LOOPS_IN * max(abreast, 2), 2 * bands * LOOPS_HIGH_IN)
     figure, axes = plt.subplots(
-        2, chambers, figsize=(4.2 * chambers, 6.2), layout="constrained", squeeze=False
+        2 * bands, abreast, figsize=size, layout="constrained", squeeze=False
     )
     figure.suptitle(_titled("Tip against actuation", title))
+    for place in range(chambers, bands * abreast):
+        for row in range(2):
+            axes[2 * (place // abreast) + row, place % abreast].set_axis_off()
     for chamber in range(chambers):
+        band, column = divmod(chamber, abreast)
         rows = _stretch(table, chamber)
         along = _main_direction(table.measured_mm[rows, -1])
         measured, predicted = table.measured_mm[:, -1] @ along, table.predicted_mm[:, -1] @ along
@@ -118,18 +129,18 @@ def loops(table: ResidualTable, unit: str, title: str = ""):
         pressure = table.pressure[rows, chamber]
         for row, (offset, what) in enumerate(
             (
-                (0 * static, "tip, main direction [mm]"),
-                (static, "minus what pressure explains [mm]"),
+                (0 * static, "tip, main\ndirection [mm]"),
+                (static, "less what actuation\nexplains [mm]"),
             )
         ):
-            axis = axes[row, chamber]
+            axis = axes[2 * band + row, column]
             shown = (measured - offset)[rows]
             axis.plot(pressure, shown, ".-", c=MEASURED, lw=0.7, ms=3, label="measured")
             shown = (predicted - offset)[rows]
             axis.plot(pressure, shown, "-", c=PREDICTED, lw=1.0, label="predicted")
             axis.set_xlabel(f"chamber {chamber + 1} [{unit}]")
             axis.grid(alpha=0.25)
-            if chamber == 0:
+            if column == 0:
                 axis.set_ylabel(what)
     axes[0, 0].legend(frameon=False)
     return figure

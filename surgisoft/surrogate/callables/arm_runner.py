@@ -1,4 +1,4 @@
-"""An arm model around a user's Python callable: pressures in, key points out, with NumPy alone.
+"""An arm model around a user's Python callable: actuation in, key points out, with NumPy alone.
 
 `surgisoft export MODEL -o DIR` writes this file as DIR/arm.py. It needs NumPy and the callable's
 own module, and nothing else of surgisoft; the effects before and behind the callable are in it.
@@ -9,8 +9,9 @@ own module, and nothing else of surgisoft; the effects before and behind the cal
     state = arm.start(pressure)                        # (B, m) -> (B, S)
     state, points = arm.step(state, pressure, dt_s)    # -> (B, S), (B, n, 3) mm
 
-`arm.json` states units, ranges and the parts of the state. The first row of a run has dt_s = 0. A
-drift with the elapsed time counts from the start of the run, or goes on from `elapsed_s`:
+`pressure` is the actuation, of whatever kind: `arm.json` states units, ranges and the parts of the
+state. The first row of a run has dt_s = 0. A drift with the elapsed time counts from the start of
+the run, or goes on from `elapsed_s`:
 
     state = arm.start(pressure, elapsed_s=600.0)       # the recording began ten minutes before
 """
@@ -48,7 +49,7 @@ class Arm:
         self.elapsed = ABOUT["state"].get("elapsed", [])
 
     def start(self, pressure, elapsed_s=0.0):
-        """State (B, S) of arms before a run that begins at pressure (B, m).
+        """State (B, S) of arms before a run that begins at actuation (B, m).
 
         elapsed_s: time since the recording began, s, which a drift follows; one number, or (B,).
         """
@@ -63,7 +64,7 @@ class Arm:
         return state
 
     def step(self, state, pressure, dt_s, temperature_C=np.nan):
-        """State (B, S) and key points (B, n, 3) mm after pressure (B, m) was held for dt_s.
+        """State (B, S) and key points (B, n, 3) mm after actuation (B, m) was held for dt_s.
 
         dt_s, temperature_C: one number, or (B,); s, and degrees Celsius, NaN where not known. For
         a callable of whole runs the state grows by 1 + m numbers in a step, up to `keep_rows`.

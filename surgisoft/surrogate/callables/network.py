@@ -6,8 +6,11 @@ actuation around its value, so that first derivatives pass, in reverse and batch
 """
 
 import hashlib
+import time
+import warnings
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from copy import deepcopy
 from typing import Any, Literal
 
@@ -15,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from surgisoft.errors import InputError, raised_by
+from surgisoft.errors import AssumptionWarning, InputError, raised_by
 from surgisoft.surrogate.callables import operators
 from surgisoft.surrogate.callables.named import (
     Named,
@@ -33,6 +36,11 @@ model's slope is of the order of its square, and a solver that is right to 1e-3 
 in the motion over the whole range."""
 CACHED = 64
 """Runs whose key points are cached, for callables of whole runs (a count)."""
+SLOW_S = 2.0
+"""Duration of one evaluation, s, from which a diagnosis takes minutes."""
+EVALUATIONS = 140
+"""Evaluations of a callable in a diagnosis or a comparison, of all rows or of some of them: counted
+for static callables and those of whole runs, with six chambers."""
 
 Form = Literal["static", "steps", "runs"]
 """Kinds of callables: a function of the row's actuation alone; one that can be stepped; one of
@@ -73,12 +81,14 @@ class CallableNetwork(nn.Module):
         self.step_size = DIFFERENCE * (high - low).where(high > low, torch.ones_like(low))
         self.cached: OrderedDict[bytes, np.ndarray] = OrderedDict()
         self._states: int | None = None
+        self.warns_if_slow = False
+        self._slow: list[float] = []
 
     def __deepcopy__(self, memo: dict) -> "CallableNetwork":
         """A network of its own with the same callable, which is never changed."""
         fresh = type(self).__new__(type(self))
         nn.Module.__init__(fresh)
-        shared = ("named", "cached")
+        shared = ("named", "cached", "_slow")
         for key, value in vars(self).items():
             if key not in vars(fresh) or key == "training":
                 fresh.__dict__[key] = value if key in shared else deepcopy(value, memo)
@@ -122,9 +132,11 @@ class CallableNetwork(nn.Module):
 
         A callable that is stepped is never called itself: it need not be callable.
         """
-        if self.form == "steps":
-            return self.step_of(self.state_of(actuation), actuation, np.zeros(len(actuation)))[1]
-        return self._static(actuation) if self.form == "static" else self._alone(actuation)
+        with self._evaluation(len(actuation)):
+            if self.form == "steps":
+                state, still = self.state_of(actuation), np.zeros(len(actuation))
+                return self.step_of(state, actuation, still)[1]
+            return self._static(actuation) if self.form == "static" else self._alone(actuation)
 
     def rest(self, pressure: Tensor) -> Tensor:
         """(B, k + 3 n) memory of arms that begin at pressure (B, m): state, then key points."""
@@ -182,17 +194,18 @@ class CallableNetwork(nn.Module):
 
         memory: (R, k + 3 n) before the first row, of a callable that is stepped.
         """
-        if self.form == "runs":
-            points = self._runs(_numbers(actuation), history)
+        with self._evaluation(int(history.valid.sum())):
+            if self.form == "runs":
+                points = self._runs(_numbers(actuation), history)
+                return torch.from_numpy(points).to(actuation)
+            if memory is None:
+                memory = self.rest(actuation[:, 0])
+            state = _numbers(memory[:, : memory.shape[1] - 3 * self.key_points])
+            moved, dt_s = _numbers(actuation), _numbers(history.dt_s)
+            points = np.empty((*moved.shape[:2], self.key_points, 3))
+            for row in range(moved.shape[1]):
+                state, points[:, row] = self.step_of(state, moved[:, row], dt_s[:, row])
             return torch.from_numpy(points).to(actuation)
-        if memory is None:
-            memory = self.rest(actuation[:, 0])
-        state = _numbers(memory[:, : memory.shape[1] - 3 * self.key_points])
-        moved, dt_s = _numbers(actuation), _numbers(history.dt_s)
-        points = np.empty((*moved.shape[:2], self.key_points, 3))
-        for row in range(moved.shape[1]):
-            state, points[:, row] = self.step_of(state, moved[:, row], dt_s[:, row])
-        return torch.from_numpy(points).to(actuation)
 
     def slope_along(
         self, actuation: Tensor, history: History, memory: Tensor | None, rows: Callable
@@ -217,6 +230,29 @@ class CallableNetwork(nn.Module):
         return no_graph(self.name)
 
     # The callable -------------------------------------------------------------------------
+
+    @contextmanager
+    def _evaluation(self, rows: int) -> Iterator[None]:
+        """Warn once, with an `AssumptionWarning`, where an evaluation of `rows` rows is slow.
+
+        A diagnosis of a slow callable goes on for minutes or hours, and looks as if it hung. Only
+        where `warns_if_slow`: environments evaluate a callable for as long as the user trains.
+        """
+        begin = time.perf_counter()
+        yield
+        seconds = time.perf_counter() - begin
+        if not self.warns_if_slow or self._slow or seconds < SLOW_S:
+            return
+        self._slow.append(seconds)
+        warnings.warn(
+            f"{self.name} took {seconds:.1f} s for {rows} rows, and a diagnosis or a comparison "
+            f"evaluates it about {EVALUATIONS} times, which may take "
+            f"{seconds * EVALUATIONS / 60:.0f} min; if that is too long, give its predictions as a "
+            "file (docs/your_model.md), or a part of the recording ('surgisoft recording REC "
+            "--from S --until S -o PART')",
+            AssumptionWarning,
+            stacklevel=2,
+        )
 
     def _differentiable(
         self,

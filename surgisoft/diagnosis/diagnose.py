@@ -182,6 +182,8 @@ FIT_BEFORE = "surgisoft fit {earlier} -o NEW"
 FAR_BEHIND = 0.05
 """Probability of the second effect of a set below which the sentence names the first: of 21 such
 sets on judged robots the first was missing in 17, the second in one."""
+PROBABLY = 0.5
+"""Probability of the first effect of such a set from which the sentence says so."""
 MOSTLY_SMOOTH = 0.5
 """Share of the error below which the discrepancy of the model alone, without an effect, leaves so
 little that the sentence has to say so: a half."""
@@ -1281,7 +1283,8 @@ def sentence_of(
             left = f"{_each_leaves(decision, reached)} on {where}{_one_alone(decision, reached)}"
         head = f"cannot tell {' from '.join(effects)} with these recordings"
         chances = [decision.probabilities.effects.get(name, 1.0) for name in effects]
-        if chances[1] < FAR_BEHIND:
+        if chances[1] < FAR_BEHIND and chances[0] >= PROBABLY:
+            left = left.partition(", which makes it ")[0]
             head = (
                 f"{effects[0]} is probably missing, with {chances[0]:.2f}, and {effects[1]} comes "
                 f"next, with {chances[1]:.2f}"

@@ -401,7 +401,7 @@ def _object(name: str) -> Any:
         sys.path.append(here)
     try:
         found: Any = _of_file(module_name) if in_file else importlib.import_module(module_name)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise InputError(
             f"rig '{name}': {'file' if in_file else 'module'} '{module_name}' does not load "
             f"({type(error).__name__}: {error}); expected package.module:object or FILE.py:object"

@@ -280,7 +280,9 @@ def test_tasks_and_rigs_that_do_not_fit_are_one_line(packaged, tmp_path):
     with pytest.raises(InputError, match="observes its scene and does not state what a controller"):
         ControllerGraph(Silent(), {})
     (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="already exists; choose another name"):
+    with pytest.raises(
+        InputError, match=r"already exists, without policy\.json; choose another name"
+    ):
         export(None, tmp_path)
 
 

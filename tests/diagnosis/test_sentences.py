@@ -402,6 +402,11 @@ def test_of_a_set_whose_second_effect_is_far_behind_the_first_is_named(second, h
     chances = replace(CHANCES, effects={"creep": 0.72, "drift": second})
     given = decision("ambiguous", "creep", "drift", chances=chances)
     assert sentence_of(given, LEVELS, [0.15, 0.16]).startswith(head)
+    told = sentence_of(given, LEVELS, [0.15, 0.3])
+    assert ("with a probability of 0.72 only" in told) == (second > 0.05)
+    weak = replace(CHANCES, effects={"creep": 0.45, "drift": 0.03})
+    given = decision("ambiguous", "creep", "drift", chances=weak)
+    assert sentence_of(given, LEVELS, [0.15, 0.16]).startswith("cannot tell creep from drift")
 
 
 def test_an_error_that_is_mostly_the_models_own_is_told_beside_a_name():

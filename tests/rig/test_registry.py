@@ -217,12 +217,14 @@ def test_a_rig_is_named_by_its_file_as_a_model_is(tmp_path, monkeypatch, capsys)
         ("away.py:Bench", "no file away.py; expected FILE.py:object"),
         ("bench.py:Bank", "'bench.py' has no 'Bank'; correct the name"),
         ("broken.py:Bench", r"file 'broken.py' does not load \(ZeroDivisionError: "),
+        ("exits.py:Bench", r"file 'exits.py' does not load \(SystemExit: 3"),
     ],
 )
 def test_a_file_that_holds_no_rig_is_one_line(text, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("bench.py").write_text("class Bench: pass")
     Path("broken.py").write_text("1 / 0")
+    Path("exits.py").write_text("raise SystemExit(3)")
     with pytest.raises(InputError, match=message):
         check_rig(text)
 

@@ -255,11 +255,14 @@ class Effect(nn.Module, ABC):
         return [reading for each in self.quantities() for reading in self._readings_of(each)]
 
     def _readings_of(self, quantity: Quantity) -> list[Reading]:
-        """The readings of one quantity; none of an array of another shape."""
+        """The readings of one quantity; none of an array of another shape, or of one whose range
+        lacks zero, such as times of a spectrum."""
         name, value = _without_unit(quantity), quantity.value
         if not isinstance(value, list | tuple):
             return [Reading(f"{name} {{}}", float(value), quantity.unit)]
         in_front = self.stage in FRONT
+        if not quantity.low <= 0.0 <= quantity.high:
+            return []
         if len(value) != (len(self.origin) if in_front else 3) or any(
             isinstance(each, list | tuple) for each in value
         ):

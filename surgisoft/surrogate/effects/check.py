@@ -119,8 +119,8 @@ def _check_one(effect: Effect, facts: ArmFacts, label: str) -> None:
                 raise wrong(
                     f"the derivative of its result by the amplitude '{name}' is zero at zero, "
                     "though the result changes with it",
-                    "a result that is linear in it near zero, by operations of torch without "
-                    "'detach'",
+                    "a result that is linear in it near zero: no square, 'abs' or 'relu' of it, "
+                    "and no 'detach'",
                 )
     quantities = effect.quantities()
     if not all(isinstance(each, Quantity) for each in quantities):

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from surgisoft.surrogate.effects import Context, Reading, in_words, make_effect
+from surgisoft.surrogate.effects import Context, Quantity, Reading, in_words, make_effect
 from tests.surrogate.effects.arms import FACTS, REST_MM, stir, variants
 
 EFFECTS = variants()
@@ -248,6 +248,17 @@ def test_an_effect_of_a_user_says_a_number_of_each_chamber_in_front_of_the_netwo
     said = super(type(gains), gains).readings()
     assert in_words(said) == "gain share of chamber 1 +0.25, gain share of chamber 2 -0.5"
     assert len(said) == 3
+
+
+def test_times_of_an_effect_of_a_user_are_not_told_as_those_of_chambers():
+    """Three times of a spectrum on an arm of three chambers: their range lacks zero."""
+
+    class Spectrum(type(make_effect("gain_mismatch", FACTS))):
+        def quantities(self):
+            return [Quantity("tau_s", [1.0, 20.0, 300.0], "s", 0.1, 2000.0, "three elements")]
+
+    effect = Spectrum(FACTS)
+    assert super(type(make_effect("gain_mismatch", FACTS)), effect).readings() == []
 
 
 def test_an_effect_of_a_user_says_a_number_of_each_axis_behind_the_network():

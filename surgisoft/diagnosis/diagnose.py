@@ -185,8 +185,8 @@ sets on judged robots the first was missing in 17, the second in one."""
 PROBABLY = 0.5
 """Probability of the first effect of such a set from which the sentence says so."""
 MOSTLY_SMOOTH = 0.5
-"""Share of the error below which the discrepancy of the model alone, without an effect, leaves so
-little that the sentence has to say so: a half."""
+"""Share of the error: where the discrepancy of the model alone, without an effect, leaves less, a
+check says so. It is a half."""
 WHERE_IT_ACTS = "surgisoft compare {model} {data}{before} --report PAGE"
 """What to run to see when, where along the body and at which actuations a model errs."""
 CANNOT_TELL = "cannot tell what is missing, if anything"
@@ -997,9 +997,9 @@ def smooth_error(levels: ErrorLevels, decision: Decision) -> list[str]:
     if decision.kind not in NAMING or alone is None or alone > MOSTLY_SMOOTH * levels.before:
         return []
     return [
-        f"of the error of {levels.before:.3g} mm only {alone:.3g} mm remain without any effect "
-        "where the model may be off by a smooth function of the actuation, and errors on held-out "
-        "blocks allow for that; 'surgisoft amend' says what the named effect leaves without it"
+        "errors on held-out blocks allow for an error of the model itself, a smooth function of "
+        f"the actuation, which alone takes the error from {levels.before:.3g} to {alone:.3g} mm; "
+        "'surgisoft amend' says what the named effect leaves without it"
     ]
 
 
@@ -1286,8 +1286,8 @@ def sentence_of(
         if chances[1] < FAR_BEHIND and chances[0] >= PROBABLY:
             left = left.partition(", which makes it ")[0]
             head = (
-                f"{effects[0]} is probably missing, with {chances[0]:.2f}, and {effects[1]} comes "
-                f"next, with {chances[1]:.2f}"
+                f"{effects[0]} is probably missing, with a probability of {chances[0]:.2f}; "
+                f"{effects[1]} comes next, with {chances[1]:.2f}"
             )
         return f"{head} (confidence {sure:.2f} that it is one of them): {left}; {error}"
     if kind == "unknown_effect":

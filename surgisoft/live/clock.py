@@ -17,8 +17,8 @@ SPIN_S = 5e-4
 MISSED = 1.5
 """An interval of more periods than this counts as an overrun where the rig keeps the time."""
 FASTER = 0.5
-"""Mean interval, in periods, below which a rig that keeps the time is one of another time than this
-computer's, as a simulation is: no overrun of it says anything."""
+"""Mean interval between samples, in periods. If it is shorter, the rig that sets the pace does not
+run on this computer's clock, as a simulation does not, and its overruns say nothing."""
 NAMED = 5
 """Number of overruns whose time is printed."""
 
@@ -72,9 +72,9 @@ class Timing:
             return f"{self.ticks:,} periods of {1e3 * self.period_s:g} ms, simulated clock; {work}"
         if self.in_another_time:
             return (
-                f"{self.ticks:,} periods of {1e3 * self.period_s:g} ms, which the rig passed in "
-                f"{1e3 * self.interval_s:.2f} ms each: it keeps a time of its own, as a simulation "
-                f"does (docs/rigs.md#a-simulation-of-your-own); {work}"
+                f"{self.ticks:,} periods of {1e3 * self.period_s:g} ms, which the rig completed in "
+                f"{1e3 * self.interval_s:.2f} ms each: it runs on a clock of its own, as a "
+                f"simulation does (docs/rigs.md#a-simulation-of-your-own); {work}"
             )
         return (
             f"{self.ticks:,} periods of {1e3 * self.period_s:g} ms; jitter "

@@ -394,7 +394,10 @@ def test_a_static_function_is_named_only_where_it_explains_most():
 @pytest.mark.parametrize(
     ("second", "head"),
     [
-        (0.03, "creep is probably missing, with 0.72, and drift comes next, with 0.03 (confidence"),
+        (
+            0.03,
+            "creep is probably missing, with a probability of 0.72; drift comes next, with 0.0",
+        ),
         (0.06, "cannot tell creep from drift with these recordings (confidence 0.75 that it is on"),
     ],
 )
@@ -413,7 +416,7 @@ def test_an_error_that_is_mostly_the_models_own_is_told_beside_a_name():
     """Of 9.7 mm a smooth function of the actuation takes all but 2.8 mm, and none of a 1 mm."""
     own = replace(LEVELS, before=9.7, discrepancy_alone=2.8)
     (text,) = smooth_error(own, decision("identified", "creep"))
-    assert text.startswith("of the error of 9.7 mm only 2.8 mm remain without any effect where the")
+    assert "which alone takes the error from 9.7 to 2.8 mm" in text
     assert smooth_error(own, decision("cannot_tell")) == []
     for alone in (0.74, None):
         levels = replace(LEVELS, before=1.02, discrepancy_alone=alone)

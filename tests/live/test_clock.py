@@ -72,7 +72,7 @@ def test_a_rig_that_keeps_another_time_has_no_overruns():
     """A simulation that is not declared as one; samples in bursts keep the period on average."""
     fast, _ = loop("rig", [0.002, 0.002, 0.09, 0.002] * 10, period_s=0.05)
     assert fast.overruns == 0
-    assert "which the rig passed in 24.00 ms each" in fast.sentence
+    assert "which the rig completed in 24.00 ms each" in fast.sentence
     assert "overruns" not in fast.sentence
     bursts, _ = loop("rig", [0.001, 0.001, 0.148] * 10, period_s=0.05)
     assert bursts.overruns == 10

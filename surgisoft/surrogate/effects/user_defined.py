@@ -7,7 +7,6 @@ code and is run only if the user named it.
 
 import functools
 import hashlib
-import importlib.util
 import sys
 from collections.abc import Container, Mapping
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
 from surgisoft.errors import InputError, path_of
+from surgisoft.python_files import run_file
 from surgisoft.surrogate.effects.base import STAGES, Effect
 
 GROUP = "surgisoft.effects"
@@ -62,25 +62,20 @@ def register_effect_file(path: str | Path, taken: Container[str] = ()) -> str:
     if name in taken or name in offered():
         raise InputError(f"{path}: an effect '{name}' exists already; rename the file")
     content = path.read_bytes()
-    module_name = f"surgisoft_effect_{name}"
-    spec = importlib.util.spec_from_file_location(module_name, path)
-    assert spec is not None, "a .py file always has a loader"
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[module_name] = module
     try:
-        exec(compile(content, str(path), "exec"), module.__dict__)
+        module = run_file(path, content, "surgisoft_effect")
     except KeyboardInterrupt:
-        del sys.modules[module_name]
         raise
     except BaseException as error:
-        del sys.modules[module_name]
         raise InputError(
             f"{path}: does not run ({type(error).__name__}: {str(error)[:120]}); correct it"
         ) from error
     own = [
         value
         for value in vars(module).values()
-        if isinstance(value, type) and issubclass(value, Effect) and value.__module__ == module_name
+        if isinstance(value, type)
+        and issubclass(value, Effect)
+        and value.__module__ == module.__name__
     ]
     made = [kind for kind in own if not kind.__abstractmethods__]
     if len(made) != 1:

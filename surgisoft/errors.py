@@ -1,6 +1,7 @@
 """`InputError`, the one error type for bad input from outside: files, options, names; warnings."""
 
 import difflib
+import os
 import signal
 import traceback
 from collections.abc import Iterable
@@ -14,6 +15,15 @@ ALIKE = 0.65
 """Least similarity (`difflib`, 0..1) of a known name that a message suggests for an unknown one."""
 SHOWN = 160
 """Most characters of a foreign exception's text in a message."""
+PACKAGE = Path(__file__).parent
+"""Folder of this package."""
+STANDARD = Path(os.__file__).parent
+"""Folder of Python's standard library."""
+INSTALLED = {"site-packages", "dist-packages"}
+"""Folders of installed packages."""
+LIBRARIES = {"torch", "numpy", "scipy"}
+"""Folders of installed packages whose lines are not named as those that raised an exception, where
+it went through code that lies elsewhere, such as that of the user's task."""
 
 
 class InputError(ValueError):
@@ -71,15 +81,55 @@ def one_line(text: str) -> str:
 def raised_by(name: str, error: BaseException, thing: str = "model", file: str = "") -> InputError:
     """The InputError for an exception in foreign code, with the line that raised it.
 
-    thing: what the user has to correct; file: the last line in this file is stated, not the last
-    one in a library that it calls.
+    thing: what the user has to correct; file: as for `raised_at`.
     """
+    return InputError(f"{name}: raised {raised_at(error, file)}; correct the {thing}")
+
+
+def raised_at(error: BaseException, file: str = "") -> str:
+    """An exception of foreign code in words: `ValueError in bad.py line 3: mesh is missing`.
+
+    file: the last line in this file is stated, not the last one in a library that it calls; without
+    it, the last line outside this package, the standard library and `LIBRARIES`, if there is one.
+    """
+    if isinstance(error, SyntaxError) and error.filename:
+        return (
+            f"{type(error).__name__} in {Path(error.filename).name} line {error.lineno}: "
+            + (error.msg[:SHOWN])
+        )
     frames = list(traceback.extract_tb(error.__traceback__))
-    where = [frame for frame in frames if frame.filename == file] or frames
+    where = [each for each in frames if each.filename == file]
+    where = where or [each for each in frames if _is_foreign(each.filename)]
     place = f" in {Path(where[-1].filename).name} line {where[-1].lineno}" if where else ""
-    return InputError(
-        f"{name}: raised {type(error).__name__}{place}: {str(error)[:SHOWN]}; correct the {thing}"
-    )
+    return f"{type(error).__name__}{place}: {str(error)[:SHOWN]}"
+
+
+def own_file(error: BaseException, offered: Iterable[str] = ()) -> str:
+    """The last file of the user's code that an exception went through; empty where there is none.
+
+    offered: installed packages that count as the user's code, by the names they are imported by.
+    """
+    files = [frame.filename for frame in traceback.extract_tb(error.__traceback__)]
+    users = {None, *offered}
+    own = [file for file in files if _is_foreign(file) and _installed_package(file) in users]
+    return own[-1] if own else ""
+
+
+def _is_foreign(file: str) -> bool:
+    """Whether a file of code lies outside this package, the standard library and `LIBRARIES`."""
+    path = Path(file)
+    if file.startswith("<") or path.is_relative_to(PACKAGE):
+        return False
+    if package := _installed_package(file):
+        return package not in LIBRARIES
+    return not path.is_relative_to(STANDARD)
+
+
+def _installed_package(file: str) -> str | None:
+    """The name by which the installed package of a file is imported; None for any other file."""
+    parts = Path(file).parts
+    place = next((i for i, part in enumerate(parts) if part in INSTALLED), None)
+    return None if place is None else Path(parts[place + 1]).stem
 
 
 def wrong_type(role: str, given: object, expected: str) -> InputError:

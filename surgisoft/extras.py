@@ -7,7 +7,13 @@ training and replays need more libraries, which the extras of the package instal
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from importlib.metadata import PackageNotFoundError, packages_distributions, requires, version
+from importlib.metadata import (
+    PackageNotFoundError,
+    entry_points,
+    packages_distributions,
+    requires,
+    version,
+)
 
 EXTRA_OF = {
     "embreex": "scene",
@@ -64,6 +70,13 @@ def with_advice() -> Iterator[None]:
         if advice is None:
             raise
         raise ModuleNotFoundError(advice, name=error.name, path=error.path) from None
+
+
+def offering_packages() -> set[str]:
+    """Installed packages that offer rigs, tasks or anything else, by the names of their modules."""
+    found = entry_points()
+    groups = [group for group in found.groups if group.startswith("surgisoft.")]
+    return {entry.module.split(".")[0] for group in groups for entry in found.select(group=group)}
 
 
 def missing_library(error: ModuleNotFoundError, use: str = "") -> str | None:

@@ -17,8 +17,8 @@ import typer
 from typer.exceptions import TyperException
 from typer.main import get_command
 
-from surgisoft.errors import AssumptionWarning, InputError
-from surgisoft.extras import missing_library
+from surgisoft.errors import AssumptionWarning, InputError, own_file, raised_by
+from surgisoft.extras import missing_library, offering_packages
 from surgisoft.files import noted_writes
 
 app = typer.Typer(
@@ -150,6 +150,12 @@ def _fail(message: str) -> int:
     return 2
 
 
+def _of_own_code(error: Exception) -> str | None:
+    """One line about an exception in the user's own code, such as a task; None for any other."""
+    file = own_file(error, offering_packages())
+    return str(raised_by(file, error, "code or what it is given")) if file else None
+
+
 def _usage(error: TyperException, many: list[str]) -> int:
     if type(error).__name__ == "NoArgsIsHelpError":
         print(error.format_message())
@@ -236,6 +242,7 @@ def _run(arguments: list[str] | None, written: list[Path]) -> int:
         code = INTERRUPTED
     except ModuleNotFoundError as error:
         advice = missing_library(error, arguments[0] if arguments else "")
+        advice = advice or _of_own_code(error)
         if advice is None:
             raise
         return _fail(advice)
@@ -248,7 +255,13 @@ def _run(arguments: list[str] | None, written: list[Path]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
-        return _fail(f"{error.filename or 'file system'}: {error.strerror or error}")
+        own = None if error.filename else _of_own_code(error)
+        return _fail(own or f"{error.filename or 'file system'}: {error.strerror or error}")
+    except Exception as error:
+        own = _of_own_code(error)
+        if own is None:
+            raise
+        return _fail(own)
     if code == INTERRUPTED and not _told.get():  # typer turns a KeyboardInterrupt into this code
         print(f"surgisoft: interrupted; {left_behind(written)}", file=sys.stderr)
     return code if isinstance(code, int) else 0

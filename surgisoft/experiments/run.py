@@ -65,9 +65,6 @@ SCENE = "scene"
 """Name of the digest of a case's own scene among those of the case."""
 WITH = " with "
 """Between an arm's name and the values of the setting, in names of such digests."""
-LIBRARIES = {"surgisoft", "torch", "numpy", "scipy"}
-"""Folders whose lines are not named as those that raised an exception, where it went through code
-that lies elsewhere, such as that of the user's task."""
 DROPPED = ("phase", "reason", "reason_phase", "late_phase", "beam", "beam_unsafe", "safe")
 """Measures of single steps whose means mean nothing."""
 
@@ -503,9 +500,7 @@ def _failed(job: Job, error: Exception) -> str:
     name = f"setting '{job.setting.label}', {episodes}"
     if isinstance(error, InputError):
         return f"{name}: {error}"
-    frames = [frame.filename for frame in traceback.extract_tb(error.__traceback__)]
-    foreign = [file for file in frames if not LIBRARIES.intersection(Path(file).parts)]
-    return str(raised_by(name, error, "code", foreign[-1] if foreign else ""))
+    return str(raised_by(name, error, "code"))
 
 
 def _may_be_real(spec: Experiment, case: Case) -> bool:

@@ -23,7 +23,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any, NamedTuple, Union, get_args, get_origin, get_type_hints
 
-from surgisoft.errors import InputError, unknown_name
+from surgisoft.errors import InputError, raised_at, raised_by, unknown_name
 from surgisoft.files import resolved
 from surgisoft.python_files import run_file
 from surgisoft.rig.drivers.serial_rig import SerialRig
@@ -254,8 +254,8 @@ def rig_factory(name: str) -> Callable[..., Rig]:
         found = entry.load()
     except Exception as error:
         raise InputError(
-            f"rig '{name}' ({entry.value}): does not load ({type(error).__name__}: {error}); "
-            "correct or remove that package"
+            f"rig '{name}' ({entry.value}): does not load ({raised_at(error)}); correct or "
+            "remove that package"
         ) from error
     return _checked_factory(name, found)
 
@@ -334,7 +334,7 @@ def open_rig(text: str, defaults: Mapping[str, Any] | None = None, **fields: Any
     in a block `with guarded(rig)` (`surgisoft.rig.safety`), which vents it at the end.
     fields: options that are given apart from the text, such as `payload_g=2.0`. defaults: options
     that count where the rig has them and nothing else gives them. Raises InputError for an unknown
-    option, a value of another type, and what the rig itself refuses.
+    option, a value of another type, what the rig itself refuses, and an exception in it.
     """
     asked = _asked(text, fields)
     own, known, values = asked.own, asked.known, asked.values
@@ -355,7 +355,7 @@ def open_rig(text: str, defaults: Mapping[str, Any] | None = None, **fields: Any
             f"expected {asked.name}:{','.join(f'{name}=...' for name in missing)}"
         )
     limits = {option: values.pop(option) for option in list(values) if option not in own}
-    rig = asked.factory(**values)
+    rig = _made(asked, values)
     if not is_simulated(rig):
         return SafeRig(rig, _safety(asked.name, limits))
     if limits:
@@ -364,6 +364,18 @@ def open_rig(text: str, defaults: Mapping[str, Any] | None = None, **fields: Any
             "and this one is simulated"
         )
     return rig
+
+
+def _made(asked: _Asked, values: dict[str, Any]) -> Any:
+    """The rig that is asked for; raises InputError for an exception in a rig of the user."""
+    try:
+        return asked.factory(**values)
+    except InputError:
+        raise
+    except (Exception, SystemExit) as error:
+        if asked.name in RIGS:
+            raise
+        raise raised_by(f"rig '{asked.name}'", error, "rig or its options") from error
 
 
 def _safety(name: str, limits: dict[str, Any]) -> Safety:
@@ -404,7 +416,7 @@ def _object(name: str) -> Any:
     except (Exception, SystemExit) as error:
         raise InputError(
             f"rig '{name}': {'file' if in_file else 'module'} '{module_name}' does not load "
-            f"({type(error).__name__}: {error}); expected package.module:object or FILE.py:object"
+            f"({raised_at(error)}); expected package.module:object or FILE.py:object"
         ) from error
     for part in path.split("."):
         if not hasattr(found, part):

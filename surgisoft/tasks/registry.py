@@ -19,7 +19,7 @@ from typing import Any
 import torch
 
 from surgisoft.config import Where, from_table, merged, read_toml, to_table
-from surgisoft.errors import InputError, unknown_name
+from surgisoft.errors import InputError, raised_at, raised_by, unknown_name
 from surgisoft.tasks.area_ablation import AREA_ABLATION
 from surgisoft.tasks.arguments import check_path, device_of, whole
 from surgisoft.tasks.base import DocumentedTask, Task
@@ -103,8 +103,7 @@ def _loaded(entry: EntryPoint) -> TaskSpec:
         spec = entry.load()
     except Exception as error:
         raise InputError(
-            f"{label}: does not load ({type(error).__name__}: {str(error)[:120]}); correct or "
-            "remove that package"
+            f"{label}: does not load ({raised_at(error)}); correct or remove that package"
         ) from error
     if not isinstance(spec, TaskSpec):
         raise InputError(
@@ -116,8 +115,9 @@ def _loaded(entry: EntryPoint) -> TaskSpec:
 def make_task(name: str, config: Any = None, device: str | torch.device = "cpu") -> DocumentedTask:
     """Build the named task; without a config with its default one.
 
-    Raises InputError for an episode of no step or of more than `MOST_STEPS`, and for a count in the
-    configuration of one of the package's tasks above `MOST_COUNT`. Warns (`AssumptionWarning`)
+    Raises InputError for an episode of no step or of more than `MOST_STEPS`, for a count in the
+    configuration of one of the package's tasks above `MOST_COUNT`, and for an exception in the code
+    that builds a task of another package. Warns (`AssumptionWarning`)
     where only the tip of an arm was measured and the task needs more of it.
     """
     spec = spec_of(name)
@@ -125,11 +125,17 @@ def make_task(name: str, config: Any = None, device: str | torch.device = "cpu")
         _check_counts(name, spec.config if config is None else config)
     try:
         task = spec.build(spec.config if config is None else config, device)
+        if name not in TASKS:
+            _check_own(name, task)
         steps = task.steps
-        if task.name != name:  # of another package
-            raise InputError(f"task '{name}': its name is '{task.name}', expected '{name}'")
     except OverflowError:  # a time over dt_s is infinite
         steps = MOST_STEPS + 1
+    except InputError:
+        raise
+    except (Exception, SystemExit) as error:
+        if name in TASKS:
+            raise
+        raise raised_by(f"task '{name}'", error, "task") from error
     if steps > MOST_STEPS:
         raise InputError(
             f"{name}: an episode of more than {MOST_STEPS:,} steps; expected shorter times, fewer "
@@ -142,6 +148,17 @@ def make_task(name: str, config: Any = None, device: str | torch.device = "cpu")
         )
     say_assumed(task.name, task.world.arms)
     return task
+
+
+def _check_own(name: str, task: Any) -> None:
+    """Raise InputError where what a package builds as a task is none, or has another name."""
+    if not hasattr(task, "name"):
+        raise InputError(
+            f"task '{name}': what builds it returns a {type(task).__name__}, expected a "
+            "surgisoft.tasks.base.Task"
+        )
+    if task.name != name:
+        raise InputError(f"task '{name}': its name is '{task.name}', expected '{name}'")
 
 
 def _check_counts(name: str, config: Any, place: str = "") -> None:

@@ -146,3 +146,75 @@ def test_what_a_package_offers_is_checked(installed):
         make_task("renamed")
     with pytest.raises(InputError, match=r"unknown task 'smoth_circle'.*smooth_circle"):
         make_task("smoth_circle")
+
+
+@pytest.fixture
+def faulty(installed):
+    """The same package with tasks whose code raises, by names of their own."""
+    (installed / "my_tasks" / "faulty.py").write_text(
+        "from dataclasses import dataclass, replace\n"
+        "from surgisoft.tasks.registry import spec_of\n"
+        "from surgisoft.tasks.track import TrackConfig\n"
+        "CIRCLE = spec_of('track_circle')\n"
+        "def build(config, device):\n"
+        "    return {}['gain']\n"
+        "def late(config, device):\n"
+        "    task = CIRCLE.build(config, device)\n"
+        "    task.name = 'late'\n"
+        "    def rewards(state):\n"
+        "        raise RuntimeError('no such sensor')\n"
+        "    task.rewards = rewards\n"
+        "    return task\n"
+        "@dataclass(frozen=True)\n"
+        "class Own(TrackConfig):\n"
+        "    price: float = 1.0\n"
+        "    def __post_init__(self):\n"
+        "        assert self.price > 0, 'a price of 0'\n"
+        "BUILD = replace(CIRCLE, build=build)\n"
+        "NONE = replace(CIRCLE, build=lambda config, device: None)\n"
+        "LATE = replace(CIRCLE, build=late)\n"
+        "OWN = replace(CIRCLE, config=Own())\n"
+    )
+    (installed / "my_tasks" / "raising.py").write_text("X = 1\nY = X / 0\n")
+    (installed / "my_tasks" / "unfinished.py").write_text("X = 1\n\ndef f(:\n")
+    (installed / "my_tasks-1.0.dist-info" / "entry_points.txt").write_text(
+        "[surgisoft.tasks]\n"
+        + "".join(f"{n} = my_tasks.faulty:{n.upper()}\n" for n in ("build", "none", "late", "own"))
+        + "raising = my_tasks.raising:X\nunfinished = my_tasks.unfinished:X\n"
+    )
+    importlib.invalidate_caches()
+    yield installed
+    for name in ("faulty", "raising", "unfinished"):
+        sys.modules.pop(f"my_tasks.{name}", None)
+
+
+FAULTY = {
+    "train --task build -o x": "task 'build': raised KeyError in faulty.py line 6: 'gain'; correct",
+    "evaluate scripted --task build": "task 'build': raised KeyError in faulty.py line 6: 'gain'",
+    "run scripted --task build -o x": "task 'build': raised KeyError in faulty.py line 6: 'gain'",
+    "evaluate scripted --task none": "task 'none': what builds it returns a NoneType, expected a",
+    "evaluate scripted --task late --episodes 1": "raised RuntimeError in faulty.py line 11: no su",
+    "train --task own price=-1.0 -o x": "raised AssertionError in faulty.py line 18: a price of 0",
+    "train --task raising -o x": "does not load (ZeroDivisionError in raising.py line 2: division",
+    "train --task unfinished -o x": "does not load (SyntaxError in unfinished.py line 3: invalid",
+}
+"""Commands on tasks whose code raises -> what they print."""
+
+
+@pytest.mark.parametrize("command", FAULTY)
+def test_a_task_that_raises_is_one_line_with_its_file(
+    command, faulty, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    assert run(command.split()) == 2
+    told = capsys.readouterr().err
+    assert FAULTY[command] in told
+    assert told.count("\n") == 1
+    assert not Path("x").exists()
+
+
+def test_an_exception_of_this_package_keeps_its_traceback(monkeypatch):
+    """No code of the user's takes part in it: here a limit that is no number."""
+    monkeypatch.setattr("surgisoft.tasks.registry.MOST_STEPS", None)
+    with pytest.raises(TypeError):
+        run("evaluate scripted --task track_circle".split())

@@ -124,9 +124,8 @@ def test_a_task_of_another_package_is_what_it_says(monkeypatch):
         lambda: make_task("number")
     )
     assert "task 'other': its name is 'b', expected 'other'" in refusal(lambda: make_task("other"))
-    assert "task 'broken' (m:x): does not load (ZeroDivisionError: division by zero)" in refusal(
-        lambda: make_task("broken")
-    )
+    said = refusal(lambda: make_task("broken"))
+    assert "task 'broken' (m:x): does not load (ZeroDivisionError in test_refusals.py line " in said
 
 
 def test_former_names_are_those_of_tables():

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from surgisoft.errors import SHOWN, InputError, raised_by
+from surgisoft.errors import InputError, raised_at, raised_by
 from surgisoft.files import resolved
 from surgisoft.python_files import run_file
 
@@ -277,6 +277,6 @@ def _guarded(name: str, load: Any) -> Any:
         raise
     except (Exception, SystemExit) as error:
         raise InputError(
-            f"{name}: cannot be imported ({type(error).__name__}: {str(error)[:SHOWN]}); expected "
-            "package.module:object or FILE.py:object, importable from here"
+            f"{name}: cannot be imported ({raised_at(error)}); expected package.module:object or "
+            "FILE.py:object, importable from here"
         ) from error

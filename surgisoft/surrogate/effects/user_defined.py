@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
-from surgisoft.errors import InputError, path_of
+from surgisoft.errors import InputError, path_of, raised_at
 from surgisoft.python_files import run_file
 from surgisoft.surrogate.effects.base import STAGES, Effect
 
@@ -68,7 +68,7 @@ def register_effect_file(path: str | Path, taken: Container[str] = ()) -> str:
         raise
     except BaseException as error:
         raise InputError(
-            f"{path}: does not run ({type(error).__name__}: {str(error)[:120]}); correct it"
+            f"{path}: does not run ({raised_at(error, str(path))}); correct it"
         ) from error
     own = [
         value
@@ -119,8 +119,8 @@ def load_offered(name: str) -> type[Effect]:
         raise
     except BaseException as error:
         raise InputError(
-            f"effect '{name}' ({entry.value}): does not load ({type(error).__name__}: "
-            f"{str(error)[:120]}); correct or remove that package"
+            f"effect '{name}' ({entry.value}): does not load ({raised_at(error)}); "
+            "correct or remove that package"
         ) from error
     _check(kind, f"effect '{name}' ({entry.value})")
     return kind

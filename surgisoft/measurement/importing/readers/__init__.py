@@ -10,7 +10,7 @@ import sys
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, raised_at
 from surgisoft.measurement.importing.raw import FileRole, RawTable, Reader
 from surgisoft.measurement.importing.readers import (
     arrays,
@@ -94,8 +94,8 @@ def reader(name: str) -> Reader:
         found = entry.load()
     except Exception as error:
         raise InputError(
-            f"reader '{name}' of {entry.value}: cannot be loaded "
-            f"({type(error).__name__}: {error}); correct or remove that package"
+            f"reader '{name}' of {entry.value}: cannot be loaded ({raised_at(error)}); "
+            "correct or remove that package"
         ) from error
     if not isinstance(found, Reader):
         raise InputError(

@@ -167,18 +167,18 @@ def collect(
 
         show_commands(protocol, rig, print, hidden=effects, **fields)
         return
-    recording = record_on(protocol, rig, output, force, preflight=arm, hidden=effects, **fields)
+    recording, log = record_on(
+        protocol, rig, output, force, preflight=arm, hidden=effects, **fields
+    )
     save_recording(recording, output, force)
-    drop_log(rig, output)
+    drop_log(log)
     print(written_line(output, recording, effects))
 
 
-def drop_log(rig: str, output: Path) -> None:
+def drop_log(log: Path | None) -> None:
     """Remove the log of a recording that is complete; a simulated rig has written none."""
-    from surgisoft.rig.registry import SIMULATED, parse_rig
-
-    if parse_rig(rig).name not in SIMULATED:
-        log_of(output).unlink(missing_ok=True)
+    if log is not None:
+        log.unlink(missing_ok=True)
 
 
 def log_of(output: Path) -> Path:
@@ -193,41 +193,49 @@ def record_on(
     force: bool = False,
     preflight: Path | None = None,
     **fields: Any,
-) -> Recording:
+) -> tuple[Recording, Path | None]:
     """Record a protocol on a rig with a progress bar; fields: as for `surgisoft.collect`.
 
-    What a real rig measures goes to the log beside `output` at once, and stays there where the run
-    is interrupted. preflight: an arm model whose motions a real rig has to show first.
+    Returns the recording, and its log where the rig is a real one. What a real rig measures goes to
+    this log beside `output` at once, and stays there where the run is interrupted. preflight: an
+    arm model whose motions a real rig has to show first.
     """
     from surgisoft.measurement.recordings.log import check_log_free
-    from surgisoft.rig.registry import SIMULATED, parse_rig
+    from surgisoft.rig.interface import is_simulated
+    from surgisoft.rig.registry import may_be_real
     from surgisoft.rig.trial import collect as collect_recording
 
-    simulated = parse_rig(rig).name in SIMULATED
-    if preflight and simulated:
-        raise InputError("--preflight is for real rigs, and this one is simulated")
+    may_move = may_be_real(rig)
+    no_preflight = InputError("--preflight is for real rigs, and this one is simulated")
+    if preflight and not may_move:
+        raise no_preflight
     log = log_of(output)
-    if not simulated:
+    if may_move:
         check_log_free(log, force)
     former = _state(log)
     check = checked_by(preflight) if preflight else None
 
     def before(rig: Rig) -> None:
+        if is_simulated(rig):
+            if check:
+                raise no_preflight
+            return
         warn(STOP_NOTE)
         if check:
             check(rig)
 
     try:
         with progress(f"collect {protocol}") as report:
-            return collect_recording(
+            recording = collect_recording(
                 protocol,
                 rig,
                 progress=report,
-                log=None if simulated else log,
+                log=log,
                 force=force,
-                before=None if simulated else before,
+                before=before if may_move else None,
                 **fields,
             )
+            return recording, log if _state(log) not in (None, former) else None
     except BaseException:
         if _state(log) not in (None, former):
             warn(f"what was measured so far is in {log}, which every command opens as a recording")

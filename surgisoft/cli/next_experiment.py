@@ -223,11 +223,11 @@ def _record(result, rig: str, schedule: Path, record: Path, force: bool) -> None
             "change of the experimental setup)"
         )
     try:
-        recording = record_on(schedule, rig, record, force, **setup)
+        recording, log = record_on(schedule, rig, record, force, **setup)
     except InputError as error:
         raise InputError(f"{error}. {schedule} is written; to record it: '{command}'") from error
     from surgisoft.measurement.recordings import save_recording
 
     save_recording(recording, record, force)
-    drop_log(rig, record)
+    drop_log(log)
     print(written_line(record, recording))

@@ -50,7 +50,7 @@ from surgisoft.experiments.spec import (
 )
 from surgisoft.files import json_safe, new_folder, read_json, resolved, write_atomically, write_json
 from surgisoft.progress import Progress, silent
-from surgisoft.rig.registry import SIMULATED, check_rig, parse_rig
+from surgisoft.rig.registry import check_rig, may_be_real
 from surgisoft.scene.folder import open_scene
 from surgisoft.surrogate.checkpoint import content_hash
 from surgisoft.surrogate.code import name_code, named_code
@@ -314,7 +314,7 @@ def _as_built(spec: Experiment, setting: Setting) -> Setting:
     texts = rigs_by_arm(case.rigs, spec.of.agents).values()
     for text in texts:
         check_rig(text)
-    if not all(parse_rig(text).name in SIMULATED for text in texts):
+    if any(map(may_be_real, texts)):
         case = Case("", policy=case.policy, arm=case.arm, scene=case.scene)
     left_out = (*ROBOT_SEED, "fault.at_s")
     values = tuple((field, value) for field, value in setting.values if field not in left_out)
@@ -508,7 +508,7 @@ def _may_be_real(spec: Experiment, case: Case) -> bool:
     if case.plant != "rig":
         return False
     texts = rigs_by_arm(case.rigs, spec.of.agents).values()
-    return not all(parse_rig(text).name in SIMULATED for text in texts)
+    return any(map(may_be_real, texts))
 
 
 def _run_missing(spec: Experiment, folder: Path, job: Job) -> list[str]:

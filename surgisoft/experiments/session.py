@@ -27,7 +27,7 @@ from surgisoft.files import resolved, write_atomically
 from surgisoft.progress import Progress, silent
 from surgisoft.replay.episode_view import write_replay
 from surgisoft.report import write_page
-from surgisoft.rig.registry import SIMULATED, check_rig, parse_rig
+from surgisoft.rig.registry import check_rig, may_be_real
 from surgisoft.scene.spec import FILE as SCENE_FILE
 from surgisoft.scene.spec import MOST_LETTERS, PHANTOM, packaged_scene
 from surgisoft.tasks.base import Task
@@ -193,8 +193,7 @@ def with_rigs(spec: Experiment, rigs: Iterable[str], preflight: bool = False) ->
     texts = rigs_by_arm(rigs, spec.of.agents).values()
     for text in texts:
         check_rig(text)
-    names = {parse_rig(text).name for text in texts}
-    together = spec.together if names <= set(SIMULATED) else 1
+    together = 1 if any(map(may_be_real, texts)) else spec.together
     return replace(spec, cases=cases, together=together)
 
 

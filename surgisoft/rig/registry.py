@@ -307,6 +307,22 @@ def _asked(text: str, beside: Iterable[str] = ()) -> _Asked:
     return _Asked(asked.name, factory, own, known, values)
 
 
+def may_be_real(text: str) -> bool:
+    """Whether the rig of a text may be a real one, as far as that is known before it opens.
+
+    The package's simulated rigs and classes with the method of a simulated rig
+    (`surgisoft.rig.interface.SimulatedRig`) are none; what a function opens may be one. Raises
+    InputError for a text that names no rig.
+    """
+    name = parse_rig(text).name
+    return name not in SIMULATED and not hasattr(rig_factory(name), "read_beside_truth")
+
+
+def given_options(text: str) -> dict[str, Any]:
+    """The options that a rig's text gives, with their types; raises InputError as `check_rig`."""
+    return _asked(text).values
+
+
 def check_rig(text: str) -> None:
     """Raise InputError for a text that names no rig, or options that it does not have.
 

@@ -13,8 +13,8 @@ from surgisoft.measurement.recordings import Recording
 from surgisoft.progress import Progress, silent
 from surgisoft.rig.collect import collect as collect_samples
 from surgisoft.rig.collect import show_commands
-from surgisoft.rig.interface import Rig
-from surgisoft.rig.registry import open_rig, parse_rig, rig_options
+from surgisoft.rig.interface import Rig, is_simulated
+from surgisoft.rig.registry import given_options, open_rig, parse_rig, rig_options
 from surgisoft.rig.safety import SafeRig, guarded
 
 TRIAL_STEP = 1_000_003
@@ -100,7 +100,7 @@ def collect(
     with guarded(bench) as driven:
         if before is not None:
             before(driven)
-        return collect_samples(driven, plan, progress, log, force)
+        return collect_samples(driven, plan, progress, None if is_simulated(driven) else log, force)
 
 
 def dry_run(
@@ -142,7 +142,9 @@ def _opened(
     if rig is None or isinstance(rig, str):
         bench = rig_of_trial(rig or "virtual", protocol, seed, trial, hidden, **mount)
         if seed is None:
-            seed = getattr(getattr(bench, "config", None), "seed", None)
+            own = getattr(getattr(bench, "config", None), "seed", None)
+            written = given_options(rig or "virtual").get("seed")
+            seed = written if isinstance(written, int) else own
     elif mount or hidden:
         given = ", ".join([*mount, *(["hidden"] if hidden else [])])
         raise InputError(

@@ -5,12 +5,15 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from surgisoft import collect
 from surgisoft.cli import run
 from surgisoft.measurement.recordings import load_recording
 from surgisoft.rig import open_rig
 from surgisoft.rig.interface import is_simulated
 
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "rigs.md"
 DEVICES = """
 import time
 import numpy as np
@@ -29,9 +32,7 @@ def wait_for_picture(seconds):
 
 def test_the_simulator_of_the_documentation_is_a_simulated_rig(tmp_path):
     """Behind a step of 10 ml its volume is 10 (1 - e^(-t / 0.2 s)), and its tip 3 mm per ml."""
-    text = Path("docs/rigs.md").read_text()
-    (source,) = re.findall(r"```python\n(\"\"\"A simulated arm of our own.*?)```", text, re.DOTALL)
-    (tmp_path / "our_arm.py").write_text(source)
+    (tmp_path / "our_arm.py").write_text(simulator())
     rig = open_rig(f"{tmp_path / 'our_arm.py'}:Simulator:noise_mm=0.02")
     assert is_simulated(rig)
     rig.reset()
@@ -45,8 +46,54 @@ def test_the_simulator_of_the_documentation_is_a_simulated_rig(tmp_path):
     assert 0.01 < np.std(seen - tip) < 0.04
 
 
+def simulator():
+    """The source of the simulator of the documentation."""
+    text = PAGE.read_text()
+    (source,) = re.findall(r"```python\n(\"\"\"A simulated arm of our own.*?)```", text, re.DOTALL)
+    return source
+
+
+@pytest.mark.parametrize("name", ["Simulator", "opened"])
+def test_collect_treats_the_simulator_as_a_simulated_rig(name, tmp_path, monkeypatch, capsys):
+    """A class, or a function of which that is known only once it is open."""
+    source = simulator() + "\n\ndef opened(seed: int = 0):\n    return Simulator(seed)\n"
+    monkeypatch.chdir(tmp_path)
+    Path("our_arm.py").write_text(source)
+    rig = f"our_arm.py:{name}"
+    collect = ["collect", "walk", "--points", "20", "--rig", rig, "-o", "r.csv"]
+    assert run([*collect, "--preflight", "--arm", "default"]) == 2
+    assert capsys.readouterr().err.endswith("real rigs, and this one is simulated\n")
+    Path("steps.csv").write_text("t_s,c1_ml,c2_ml\n0,0,0\n1,2,8\n2,2,8\n")
+    assert run(["collect", "steps.csv", "--rig", rig, "-o", "r.csv"]) == 0
+    printed = capsys.readouterr()
+    assert "emergency stop" not in printed.err
+    assert printed.out.startswith("wrote r.csv: ")
+    assert not Path("r.log.jsonl").exists()
+    assert run(["collect", "steps.csv", "--rig", rig, "-o", "x.csv", "--dry-run"]) == 2
+    assert capsys.readouterr().err.endswith("is for real rigs, and this one is simulated\n")
+
+
+def test_a_recording_of_the_simulator_leaves_the_log_of_a_real_rig(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("our_arm.py").write_text(simulator())
+    Path("steps.csv").write_text("t_s,c1_ml,c2_ml\n0,0,0\n1,2,8\n2,2,8\n")
+    Path("r.log.jsonl").write_text("what was measured until then")
+    assert run(["collect", "steps.csv", "--rig", "our_arm.py:Simulator", "-o", "r.csv"]) == 0
+    assert Path("r.log.jsonl").read_text() == "what was measured until then"
+
+
+def test_the_seed_in_the_text_of_an_own_rig_is_that_of_the_random_schedule(tmp_path):
+    (tmp_path / "our_arm.py").write_text(simulator().replace('"ml"', '"kPa"'))
+    rig = f"{tmp_path / 'our_arm.py'}:Simulator"
+    beside = collect("walk", rig, seed=3, points=40)
+    inside = collect("walk", f"{rig}:seed=3", points=40)
+    other = collect("walk", rig, points=40)
+    np.testing.assert_array_equal(inside.commanded, beside.commanded)
+    assert not np.array_equal(other.commanded, beside.commanded)
+
+
 def test_the_rig_of_the_documentation_runs(tmp_path, monkeypatch):
-    text = Path("docs/rigs.md").read_text()
+    text = PAGE.read_text()
     (source,) = re.findall(r"```python\n(\"\"\"A bench of our lab.*?)```", text, re.DOTALL)
     assert source.count("\n") < 55
     (tmp_path / "my_lab_bench.py").write_text(source)

@@ -217,4 +217,4 @@ def test_an_exception_of_this_package_keeps_its_traceback(monkeypatch):
     """No code of the user's takes part in it: here a limit that is no number."""
     monkeypatch.setattr("surgisoft.tasks.registry.MOST_STEPS", None)
     with pytest.raises(TypeError):
-        run("evaluate scripted --task track_circle".split())
+        run(["evaluate", "scripted", "--task", "track_circle"])

@@ -1,13 +1,19 @@
 """`surgisoft rig`: the rigs that commands can drive, their options, and a pre-flight check."""
 
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from surgisoft.cli import app
 from surgisoft.cli.inputs import check_model
 from surgisoft.cli.options import EffectFiles
+
+if TYPE_CHECKING:
+    from surgisoft.rig.registry import RigOption
 
 commands = typer.Typer(no_args_is_help=True, help="Rigs that commands can drive: list, check.")
 app.add_typer(commands, name="rig")
@@ -18,34 +24,43 @@ def list_(
     name: Annotated[
         str | None,
         typer.Argument(
-            metavar="NAME",
-            help="Show this rig only; also package.module:object or FILE.py:object.",
+            metavar="NAME[:option=value,...]",
+            help="Show this rig only; also package.module:object or FILE.py:object. Options that "
+            "are given are checked, and shown with their values.",
         ),
     ] = None,
 ) -> None:
     """List the rigs and the options of each: NAME:option=value,..."""
     from surgisoft.rig.registry import (
-        SIMULATED,
+        check_rig,
+        may_be_real,
+        parse_rig,
         rig_about,
         rig_names,
         rig_options,
         safety_options,
     )
 
-    names = [name] if name else rig_names()
+    given: Mapping[str, str] = {}
+    if name:
+        check_rig(name)
+        given = parse_rig(name).options
+    names = [parse_rig(name).name] if name else rig_names()
     for each in names:
         print(f"{each}: {rig_about(each)}")
-        _show(rig_options(each).values())
-    if set(names) - set(SIMULATED):
+        _show(rig_options(each).values(), given)
+    if any(map(may_be_real, names)):
         print("every rig that is not simulated also has the limits of the safety wrapper:")
-        _show(safety_options().values())
+        _show(safety_options().values(), given)
 
 
-def _show(options) -> None:
+def _show(options: Iterable[RigOption], given: Mapping[str, str]) -> None:
+    """Print a line for each option; given: values of a rig's text, by the option's name."""
     from surgisoft.rig.registry import REQUIRED, describe_kind
 
     for option in options:
         default = "required" if option.default is REQUIRED else f"default {option.shown}"
+        default += f", given {given[option.name]}" if option.name in given else ""
         about = f"{option.about}; " if option.about else ""
         print(f"  {option.name:14s}{about}{describe_kind(option.kind)}, {default}")
 

@@ -291,11 +291,8 @@ def _asked(text: str, beside: Iterable[str] = ()) -> _Asked:
     asked = parse_rig(text)
     factory = rig_factory(asked.name)
     own = _options(asked.name, factory)
-    known = (
-        own
-        if asked.name in SIMULATED
-        else own | {name: option for name, option in safety_options().items() if name not in own}
-    )
+    limits = safety_options() if may_be_real(asked.name) else {}
+    known = own | {name: option for name, option in limits.items() if name not in own}
     unknown = [name for name in (*asked.options, *beside) if name not in known]
     if unknown:
         has = ", ".join(known) or "none"

@@ -232,6 +232,36 @@ def test_a_file_that_holds_no_rig_is_one_line(text, message, tmp_path, monkeypat
         check_rig(text)
 
 
+def test_list_shows_a_rig_with_the_options_of_its_text(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("sim.py").write_text(
+        "class Sim:\n    'An arm of ours.'\n"
+        "    def __init__(self, seed: int = 7, noise_mm: float = 0.1): pass\n"
+        "    def read_beside_truth(self): pass\n"
+    )
+    options = [
+        "  seed          a whole number, default 7",
+        "  noise_mm      a finite number, default",
+    ]
+    assert run(["rig", "list", "sim.py:Sim"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "sim.py:Sim: An arm of ours.",
+        options[0],
+        f"{options[1]} 0.1",
+    ]
+    assert run(["rig", "list", "sim.py:Sim:seed=3"]) == 0
+    assert capsys.readouterr().out.splitlines()[1:] == [
+        f"{options[0]}, given 3",
+        f"{options[1]} 0.1",
+    ]
+    assert run(["rig", "list", f"{OWN}:port=x,highest=20"]) == 0
+    shown = capsys.readouterr().out
+    assert "required, given x" in shown
+    assert "default inf, given 20" in shown
+    assert run(["rig", "list", "sim.py:Sim:sed=3"]) == 2
+    assert "unknown option 'sed'; its options: seed, noise_mm" in capsys.readouterr().err
+
+
 RAISING = """
 from tests.rig.own_rig import OwnRig
 

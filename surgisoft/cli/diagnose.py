@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from surgisoft.cli import app
+from surgisoft.cli import INTERRUPTED, app
 from surgisoft.cli.files import (
     check_folder,
     check_free,
@@ -42,7 +42,7 @@ from surgisoft.cli.options import (
 )
 from surgisoft.cli.progress import progress
 from surgisoft.command_line import typed
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, Interrupted
 from surgisoft.files import write_json
 from surgisoft.progress import Progress
 
@@ -126,20 +126,24 @@ def diagnose(
     keep_freed_memory(MOST_KEPT)
     with progress("diagnose") as tell:
         stages = iter(range(1, 100))
-        found = diagnose_model(
-            model,
-            measured,
-            lambda text: tell.step(next(stages), 6, text),
-            without=without or (),
-            setup_tests=setup_tests,
-            before=earlier,
-            paired=paired,
-            refit=refit,
-            refit_progress=announced(tell),
-            processes=REFIT_PROCESSES,
-            predictions=predictions,
-            error_mm=model_error,
-        )
+        try:
+            found = diagnose_model(
+                model,
+                measured,
+                lambda text: tell.step(next(stages), 6, text),
+                without=without or (),
+                setup_tests=setup_tests,
+                before=earlier,
+                paired=paired,
+                refit=refit,
+                refit_progress=announced(tell),
+                processes=REFIT_PROCESSES,
+                predictions=predictions,
+                error_mm=model_error,
+            )
+        except Interrupted as ended:
+            found = ended.result
+            warn("interrupted; the verdict is that of the residuals (Ctrl-C again ends at once)")
     warn_all(found.notes)
     data = typed_once(recordings)
     # Predictions of `--before` come last.
@@ -183,6 +187,8 @@ def diagnose(
         print(f"nothing to correct: {apply} was not written")
     if following:
         print(f"next: {following}")
+    if found.interrupted:
+        raise typer.Exit(INTERRUPTED)
 
 
 def announced(tell: Progress) -> Progress:

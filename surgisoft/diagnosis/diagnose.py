@@ -89,7 +89,7 @@ from surgisoft.diagnosis.selection import (
 )
 from surgisoft.diagnosis.setup import SetupResult, find_setup_faults
 from surgisoft.diagnosis.testability import NotTestable, testable
-from surgisoft.errors import InputError, unknown_name
+from surgisoft.errors import InputError, Interrupted, unknown_name
 from surgisoft.files import with_former_keys
 from surgisoft.measurement.histories import check_fits, faster_than_fit
 from surgisoft.measurement.recordings import Recording, load_recordings
@@ -134,6 +134,12 @@ SHORT_S = 60.0
 """Duration of the rows looked at below which candidates are not fitted together with the network,
 unless an effect is named that the network could do as well [s]: twelve motions of five seconds. The
 errors of so few motions, a third of which is left out of each training, prove no effect."""
+REFIT_INTERRUPTED = (
+    "interrupted while candidates were fitted together with the network: the verdict is that of "
+    "the residuals alone, from which an effect that the network has learned to imitate is missing; "
+    "--refit never asks for no more"
+)
+"""What is said of a diagnosis whose fits with the network were interrupted."""
 NO_PAST = (
     "the model does not keep what is needed to tell what has changed since its fit: give the "
     "recordings of the fit by --before"
@@ -361,6 +367,8 @@ class Diagnosis:
     """All statements that could be made with these probabilities, worth most first."""
     refit: Refit | None = None
     """What candidates did that were fitted together with the network; None where none was."""
+    interrupted: bool = False
+    """Whether Ctrl-C ended the fit with the network: the verdict is that of the residuals alone."""
     in_fit: float | None = None
     """Share 0..1 of the rows looked at that the model was fitted to; None where it does not say."""
     along: ErrorAlong | None = None
@@ -456,7 +464,8 @@ def diagnose(
     fit candidates together with the network (`surgisoft.diagnosis.refit`), not where recordings
     from before are given; refit_progress: called while that goes on; processes: how many trainings
     then run at once, with the same result. More than one starts new Python processes, so a script
-    has to guard its start by `if __name__ == "__main__"`.
+    has to guard its start by `if __name__ == "__main__"`. Ctrl-C during these fits raises
+    `Interrupted` (`surgisoft.errors`) with the diagnosis from the residuals alone.
     """
     begin = time.perf_counter()
     report = progress or (lambda text: None)
@@ -509,14 +518,19 @@ def diagnose(
                 reason, result = "", too_short(result, seconds)
         if reason:
             cannot = [*without, *(each.effect for each in not_testable)]
-            joint = fit_candidates_together(
-                problem, reason, cannot, progress=refit_progress, processes=processes
-            )
-            result = with_refit(result, joint, problem)
+            try:
+                joint = fit_candidates_together(
+                    problem, reason, cannot, progress=refit_progress, processes=processes
+                )
+                result = with_refit(result, joint, problem)
+            except KeyboardInterrupt:
+                checks = (*result.checks, REFIT_INTERRUPTED)
+                result = replace(result, checks=checks, interrupted=True)
         if result.verdict.kind == "unknown_effect":
             result = with_axis(result, problem)
         of_arm = reference is None and result.verdict.reason != "arm"
-        if of_arm and not problem.in_fit and faster_than_fit(model.spec, whole):
+        asked = of_arm and not result.interrupted
+        if asked and not problem.in_fit and faster_than_fit(model.spec, whole):
             report("what has changed since the fit")
             changed = changed_since_fit(table, without, (problem, tried))
             result = replace(result, since_fit=changed)
@@ -526,7 +540,10 @@ def diagnose(
         result = replace(result, next_command=amend_command(result, unknown))
     valves = valve_hints(whole, earlier, model.spec.actuation)
     checks = (*alarm_hints(whole, recordings), *gap_hints(whole), *valves, *result.checks)
-    return replace(result, checks=checks, notes=notes, seconds=time.perf_counter() - begin)
+    result = replace(result, checks=checks, notes=notes, seconds=time.perf_counter() - begin)
+    if result.interrupted:
+        raise Interrupted(result)
+    return result
 
 
 def recorded_s(problem: Problem) -> float | None:

@@ -455,8 +455,8 @@ def improve(
         add_effects()
     except KeyboardInterrupt:
         steps = [done for done in rounds if done.step is not None]
-        if not steps:
-            raise
+        if not steps:  # nor is a diagnosis, which `Interrupted` may hold, a result of this function
+            raise KeyboardInterrupt from None
         del made[len(steps) + 1 :]
         rounds.append(_interrupted(steps))
     final_model = made[-1].model

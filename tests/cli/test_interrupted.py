@@ -186,6 +186,53 @@ def test_ctrl_c_in_a_later_stage_of_a_fit_keeps_the_finished_stages(
     assert "the model is that of the finished stages: pressure" in error
 
 
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory):
+    """A recording in motion, on which candidates can be fitted together with the network."""
+    recording = tmp_path_factory.mktemp("moving") / "rec.parquet"
+    assert run(["collect", "mixed", "--points", "1000", "-o", str(recording)]) == 0
+    return recording
+
+
+def test_ctrl_c_in_a_refit_keeps_the_verdict_of_the_residuals(
+    moving, tmp_path, monkeypatch, capsys
+):
+    command = f"diagnose default {moving} --refit"
+    assert run([*command.split(), "never", "--json", str(tmp_path / "never.json")]) == 0
+    alone = json.loads((tmp_path / "never.json").read_text())
+    sentence = alone["verdict"]["sentence"]
+    assert sentence in capsys.readouterr().out
+    out, error = interrupted(
+        f"{command} always --json j.json --report page",
+        r"diagnose: .*fitted together: ",
+        tmp_path,
+        monkeypatch,
+        capsys,
+    )
+    found = json.loads((tmp_path / "j.json").read_text())
+    assert (found["interrupted"], alone["interrupted"]) == (True, False)
+    assert found["verdict"] == alone["verdict"]
+    assert found["ranking"] == alone["ranking"]
+    assert found["refit"] is None
+    says = "interrupted while candidates were fitted together with the network: the verdict is that"
+    assert out.startswith(f"{found['verdict']['kind']}: {sentence}\n")
+    assert f"check: {says}" in out
+    assert says[1:] in (tmp_path / "page" / "diagnosis.html").read_text(encoding="utf-8")
+    assert error.splitlines()[-1].startswith(
+        "surgisoft: interrupted; written before and complete: j.json, page"
+    )
+
+
+def test_ctrl_c_in_the_refit_of_the_first_round_of_improve_leaves_nothing(
+    moving, tmp_path, monkeypatch, capsys
+):
+    """A diagnosis without its fits is no finished round."""
+    command = f"improve default {moving} -o NEW --refit always"
+    _, error = interrupted(command, r"improve: .*fitted together: ", tmp_path, monkeypatch, capsys)
+    assert error.splitlines()[-1].endswith("interrupted; no output was written")
+    assert names(tmp_path) == []
+
+
 def test_ctrl_c_in_improve_keeps_the_finished_rounds(tmp_path, monkeypatch, capsys):
     collect = f"collect mixed --points 1000 --hidden creep payload -o {tmp_path / 'rec.parquet'}"
     assert run(collect.split()) == 0

@@ -202,6 +202,7 @@ def _show(
         )
     if open_:
         print(f"{len(open_)} of {len(result.pairs)} pairs stay below {SURE:g} in this time")
+    print(result.chances_in_words)
     print(f"wrote {output}: {len(result.protocol.run_rows)} runs, {result.protocol.unit}")
 
 

@@ -365,6 +365,49 @@ def test_an_experiment_that_is_not_needed_says_what_else_may_be_the_matter(befor
     assert ("both may be missing" in found.why) == told
 
 
+@pytest.mark.parametrize(
+    ("validated_mm", "said"),
+    [
+        (
+            0.0523,
+            "the noise of the cameras, 2 times the validated error of the model (0.052 mm)",
+        ),
+        (None, "2 times an error of the model of 5 % of its length and the effects' own misfit"),
+    ],
+)
+def test_a_chance_says_what_it_counts(validated_mm, said):
+    found = Recommendation(
+        "steps",
+        Protocol("p", "settled", [[0.0]], [0]),
+        AS_IT_STANDS,
+        5.0,
+        (Pair(("payload", "line_lag"), 0.6, 0.99),),
+        (),
+        validated_mm=validated_mm,
+    )
+    assert said in found.chances_in_words
+    assert "and not for other causes, which 'surgisoft diagnose' weighs too" in (
+        found.chances_in_words
+    )
+    assert found.to_json()["chances_in_words"] == found.chances_in_words
+
+
+def test_the_chance_falls_with_the_validated_error_that_is_stated(arm):
+    """And the recommendation states the error of the model, by which it was computed."""
+    rough = arm.replace(
+        validation=replace(
+            arm.validation,
+            rmse_mm=10.0 * arm.validation.rmse_mm,
+            per_key_point_mm=tuple(10.0 * mm for mm in arm.validation.per_key_point_mm),
+        )
+    )
+    fine, crude = (
+        propose(each, ["twist", "coupling"], 5.5, (AS_IT_STANDS,)) for each in (arm, rough)
+    )
+    assert crude.validated_mm == pytest.approx(10.0 * fine.validated_mm)
+    assert crude.pairs[0].after < fine.pairs[0].after
+
+
 def planned(setting, minutes, chances):
     """A plan with the chance of each of the three pairs of creep, line_lag and drift."""
     names = ("creep", "line_lag", "drift")

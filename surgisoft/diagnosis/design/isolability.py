@@ -48,6 +48,8 @@ FORM_S = 20.0
 """Time over which what it misses stays alike, s: the blocks of time that a diagnosis holds out."""
 ROOM = 2.0
 """Factor on the validated error that is allowed for."""
+UNVALIDATED_SHARE = 0.05
+"""Error of a key point that takes its place where a model has none, as a share of its length."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -622,7 +624,7 @@ def uncertainty_of(
     if noise_mm is None:
         noise_mm = np.full(points, CAMERA_SHARE * length)
     validated = [value or 0.0 for value in model.validation.per_key_point_mm]
-    surrogate = np.array(validated or [0.05 * length] * points)
+    surrogate = np.array(validated or [UNVALIDATED_SHARE * length] * points)
     return Uncertainty(
         np.asarray(noise_mm, float),
         surrogate,

@@ -22,7 +22,9 @@ from surgisoft.diagnosis.design.isolability import (
     FORM_S,
     MISFIT,
     PERIOD_S,
+    ROOM,
     SURE,
+    UNVALIDATED_SHARE,
     Design,
     Draws,
     Form,
@@ -615,6 +617,9 @@ class Recommendation:
     notes: tuple[str, ...] = ()
     """Recordings under another direction of gravity, or beyond the range of the model's fit; how
     recordings from before were compared."""
+    validated_mm: float | None = None
+    """Validated error of the model, of which the chances allow for `ROOM` times, mm; None where it
+    has none, and `UNVALIDATED_SHARE` of the arm's length takes its place."""
     paired: bool = False
     """Whether the recordings so far count as paired differences to those from before."""
 
@@ -659,6 +664,23 @@ class Recommendation:
             + (f"; {TOLD_APART}" if worst.before >= SURE else "")
         )
 
+    @property
+    def chances_in_words(self) -> str:
+        """What the chances of the pairs stand for."""
+        error = f"{ROOM:g} times the validated error of the model"
+        if self.validated_mm is None:
+            share = 100.0 * UNVALIDATED_SHARE
+            error = f"{ROOM:g} times an error of the model of {share:g} % of its length"
+        else:
+            error += f" ({self.validated_mm:.2g} mm)"
+        return (
+            "a chance is that of naming the right one of the two where one of them, alone and as "
+            "large as expected, is what is missing; it allows for the noise of the cameras, "
+            f"{error} and the effects' own misfit, and not for other causes, which 'surgisoft "
+            "diagnose' weighs too: with a chance near 1 it may still answer cannot_tell or give a "
+            "set"
+        )
+
     def to_json(self) -> dict:
         """Plain values, as `next-experiment --json` writes them."""
         return {
@@ -674,6 +696,7 @@ class Recommendation:
                 {"effects": list(p.effects), "before": p.before, "after": p.after}
                 for p in self.pairs
             ],
+            "chances_in_words": self.chances_in_words,
             "notes": list(self.notes),
         }
 
@@ -870,6 +893,7 @@ def _worded(question: Question, plan: Plan, limits: np.ndarray) -> Recommendatio
         for f in dict.fromkeys(plan.figures)
     )
     about = setting.about.format(**words)
+    validation = question.model.validation
     steps = [f"{about} (about {setting.minutes:g} min)"] if about else []
     steps += [
         f"if the error is gone then, the missing effect is {name}; if it stays, it is not"
@@ -880,5 +904,13 @@ def _worded(question: Question, plan: Plan, limits: np.ndarray) -> Recommendatio
         f"{words['resting']} that has rested half a minute"
     )
     return Recommendation(
-        name, protocol, plan.setting, plan.minutes, pairs, tuple(steps), options, plan.result
+        name,
+        protocol,
+        plan.setting,
+        plan.minutes,
+        pairs,
+        tuple(steps),
+        options,
+        plan.result,
+        validated_mm=validation.rmse_mm if validation.per_key_point_mm else None,
     )

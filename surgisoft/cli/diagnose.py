@@ -169,7 +169,9 @@ def diagnose(
 
         track, names = found.track, ", ".join(recording.name for recording in measured)
         points = (track.before_mm, track.after_mm, track.explained_mm)
-        write_change(track.t_s, *points, f"{model.name} on {names}", replay)
+        known = (each.gravity for each in measured if each.gravity is not None)
+        gravity = next(known, None)
+        write_change(track.t_s, *points, f"{model.name} on {names}", replay, gravity)
         written.append(replay)
     elif replay:
         warn(f"{replay} was not written: no rows of the same actuation before and after")

@@ -255,6 +255,13 @@ class ResidualTable:
         return self.model.rest_mm.double().cpu().numpy()
 
     @property
+    def drawn_gravity(self) -> np.ndarray | None:
+        """(3,) direction of the weight, base frame, which pictures draw downward: that of the first
+        row of which it is known; None where it is known of none."""
+        known = np.flatnonzero(np.isfinite(self.gravity).all(axis=1))
+        return self.gravity[known[0]] if len(known) else None
+
+    @property
     def residual_mm(self) -> np.ndarray:
         """(N, n, 3) measured less predicted, base frame, mm; NaN where missing."""
         return self.measured_mm - self.predicted_mm

@@ -30,6 +30,7 @@ from surgisoft.replay.shapes import finer
 from surgisoft.tasks.episodes.parts import Event
 from surgisoft.time_axis import continued, pauses
 from surgisoft.units import actuation_word
+from surgisoft.viewpoint import upright
 
 MOST_ROWS = 6000
 """Longer comparisons are thinned evenly to so many rows."""
@@ -40,8 +41,32 @@ MEASURED_WIDE, PREDICTED_WIDE, POINT_WIDE, ARROW_WIDE, BAR_WIDE = 0.008, 0.012, 
 second body is dashed and thicker, so that both are seen where one lies in the other."""
 DASHES, DASH_SHARE, DASH_POINTS = 12, 0.4, 4
 """Dashes along a body, how much of their spacing they fill, and the points of each."""
+BARS_SHARE = 0.25
+"""Room for the scale bars below the workspace, as a share of the body's length."""
+AWAY = 1.1
+"""Distance of the eye, in units of the workspace's diagonal: all of it is in view (a sphere around
+it would need 1.08 at the viewer's opening of 55 degrees)."""
 SEEN, EVENTS = "/seen", "/events"
 """Entities of the text panel and of the events."""
+
+
+class View:
+    """From where bodies are seen: their workspace in axes of which the third is up on the bench."""
+
+    def __init__(
+        self,
+        points_mm: np.ndarray,
+        gravity: Sequence[float] | np.ndarray | None = None,
+        below_mm: float = 0.0,
+    ):
+        """points_mm: (S, n, 3) key points, base frame; gravity: direction of the weight (3,), or
+        None; below_mm: room below them, mm."""
+        self.axes = np.stack(upright(gravity))
+        """(3, 3) unit vectors to the right, away from the eye and up, base frame."""
+        points = points_mm[np.isfinite(points_mm).all(-1)] @ self.axes.T
+        self.low_mm, self.high_mm = points.min(axis=0), points.max(axis=0)
+        """(3,) corners of the workspace in these axes, mm."""
+        self.below_mm = below_mm
 
 
 def write_comparison(
@@ -56,6 +81,7 @@ def write_comparison(
     seen: str = "",
     events: Sequence[Event] = (),
     large_mm: float | None = None,
+    gravity: Sequence[float] | np.ndarray | None = None,
 ) -> Replay:
     """Write measured against predicted key points as an .rrd file.
 
@@ -66,7 +92,8 @@ def write_comparison(
     and the times of `events` are on the axis of `continued`. The bodies nearly coincide, so the
     predicted one is dashed, and each error is also drawn as an arrow from measured to predicted,
     magnified, and coloured from none to `large_mm` (default: the 95 % quantile of the worst model,
-    rounded up).
+    rounded up). gravity: direction of the weight (3,), base frame, which is drawn downward; None:
+    not known, z is drawn upward.
     """
     began, path = time.perf_counter(), Path(path)
     models = predicted_mm if isinstance(predicted_mm, Mapping) else {"model": predicted_mm}
@@ -82,13 +109,14 @@ def write_comparison(
     scale = error_scale(measured, list(errors.values()), large_mm)
     pressure = None if pressure is None else np.asarray(pressure, float)[keep]
     lines = _lines(errors, pressure, unit)
-    blueprint = _layout(measured, errors, lines, scale, float(time_s[-1]), bool(seen), bool(events))
+    view = View(measured, gravity, BARS_SHARE * scale.body_mm)
+    blueprint = _layout(view, errors, lines, scale, float(time_s[-1]), bool(seen), bool(events))
     with new_recording(path, "surgisoft_comparison", name, blueprint) as recording:
         columns = Columns(recording, time_s)
         recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         body = scale.body_mm
         _log_body(columns, "/measured", measured, MEASURED_COLOUR, MEASURED_WIDE * body)
-        _log_bars(recording, measured, scale)
+        _log_bars(recording, view, scale)
         for number, (label, points) in enumerate(models.items(), 1):
             where, colour = f"/model{number}", rgb(model_colour(number - 1))
             _log_body(columns, where, points, colour, PREDICTED_WIDE * body, dashed=True)
@@ -116,6 +144,7 @@ def write_change(
     explained_mm: np.ndarray,
     name: str,
     path: str | Path,
+    gravity: Sequence[float] | np.ndarray | None = None,
 ) -> Replay:
     """Write key points before and after a change, and what effects explain of it, as an .rrd file.
 
@@ -123,7 +152,7 @@ def write_change(
     base frame, nan where missing; explained_mm (S, n, 3) the explained change. The body after is
     dashed. Both changes are drawn as arrows from the body before, magnified by the factor in the
     view's title: the measured one in the colour of the body after, the explained one in that of a
-    plan.
+    plan. gravity: as for `write_comparison`.
     """
     began, path = time.perf_counter(), Path(path)
     given = (t_s, before_mm, after_mm, explained_mm)
@@ -149,7 +178,8 @@ def write_change(
         ],
     }
     title = f"{name}: changes x {stretch:g}"
-    blueprint = _beside(title, before, ("/before", "/after", "/change"), lines, time_s[-1])
+    view = View(before, gravity)
+    blueprint = _beside(title, view, ("/before", "/after", "/change"), lines, time_s[-1])
     with new_recording(path, "surgisoft_change", name, blueprint) as recording:
         columns = Columns(recording, time_s)
         recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -277,20 +307,18 @@ def _log_errors(columns: Columns, where: str, measured, predicted, error, scale:
     columns.send(f"{where}/errors/arrows", rows, arrows.partition(counts))
 
 
-def _log_bars(recording, measured: np.ndarray, scale: Scale) -> None:
-    """Log two bars beside the workspace: one of lengths, one of the magnified errors."""
-    points = measured[np.isfinite(measured).all(-1)]
-    low, high = points.min(axis=0), points.max(axis=0)
+def _log_bars(recording, view: View, scale: Scale) -> None:
+    """Log two bars below the workspace: one of lengths, one of the magnified errors."""
     length = scale.bar_mm
     error = bar_length(length / scale.stretch)
-    corner = np.array([low[0], low[1], low[2] - 0.12 * scale.body_mm])
-    corner[0] = 0.5 * (low[0] + high[0]) - 0.5 * length
+    low, high = view.low_mm, view.high_mm
+    corner = np.array([0.5 * (low[0] + high[0] - length), low[1], low[2] - 0.12 * scale.body_mm])
     strips, labels = [], []
     for row, (drawn, text) in enumerate(
         ((length, f"{length:g} mm"), (scale.stretch * error, f"error of {error:g} mm"))
     ):
         start = corner - np.array([0.0, 0.0, 0.10 * row * scale.body_mm])
-        strips.append(np.stack((start, start + np.array([drawn, 0.0, 0.0]))))
+        strips.append(np.stack((start, start + np.array([drawn, 0.0, 0.0]))) @ view.axes)
         labels.append(text)
     bars = rr.LineStrips3D(
         strips,
@@ -307,7 +335,7 @@ def _log_legend(recording, names: Sequence[str], scale: Scale) -> None:
     recording.log(LEGEND, picture, static=True)
 
 
-def _layout(measured, errors, lines, scale: Scale, end_s: float, seen: bool, events: bool):
+def _layout(view: View, errors, lines, scale: Scale, end_s: float, seen: bool, events: bool):
     """Models side by side over legend and text; plots and events to the right."""
     views = []
     for number, (label, error) in enumerate(errors.items(), 1):
@@ -315,7 +343,7 @@ def _layout(measured, errors, lines, scale: Scale, end_s: float, seen: bool, eve
         rms = float(np.sqrt(np.square(known).mean()))
         title = f"{label}: error {rms:.3g} mm (arrows x {scale.stretch:g})"
         shown = ("/measured", "/bars", f"/model{number}")
-        views.append(_space(title, measured, shown, 0.25 * scale.body_mm))
+        views.append(_space(title, view, shown))
     bodies = views[0] if len(views) == 1 else rrb.Horizontal(*views)
     below: list = [rrb.Spatial2DView(origin=LEGEND, name="Legend", background=BACKGROUND)]
     if seen:
@@ -344,21 +372,20 @@ def _plot(title: str, group: Sequence[Line], end_s: float) -> rrb.TimeSeriesView
     )
 
 
-def _space(
-    title: str, points_mm: np.ndarray, entities: Sequence[str], below_mm: float = 0.0
-) -> rrb.Spatial3DView:
-    """A view of some entities in space: the points (S, n, 3) mm, and so much below them."""
-    points = points_mm[np.isfinite(points_mm).all(-1)]
-    low, high = points.min(axis=0) - [0.0, 0.0, below_mm], points.max(axis=0)
+def _space(title: str, view: View, entities: Sequence[str]) -> rrb.Spatial3DView:
+    """A view of some entities in space."""
+    low, high = view.low_mm - [0.0, 0.0, view.below_mm], view.high_mm
     middle, size = 0.5 * (low + high), float(np.linalg.norm(high - low))
-    eye = middle + 0.95 * size * np.array([0.35, -0.9, 0.3])
+    eye = middle + AWAY * size * np.array([0.35, -0.9, 0.3])
     return rrb.Spatial3DView(
         origin="/",
         contents=[f"+ {entity}/**" for entity in entities],
         name=title,
         background=rrb.Background(BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=rrb.EyeControls3D(position=eye, look_target=middle, eye_up=(0.0, 0.0, 1.0)),
+        eye_controls=rrb.EyeControls3D(
+            position=eye @ view.axes, look_target=middle @ view.axes, eye_up=view.axes[2]
+        ),
     )
 
 
@@ -371,7 +398,7 @@ def _window(content) -> rrb.Blueprint:
     )
 
 
-def _beside(title: str, points_mm, entities, lines, end_s: float) -> rrb.Blueprint:
+def _beside(title: str, view: View, entities, lines, end_s: float) -> rrb.Blueprint:
     """A view of some entities in space, beside the plots."""
     plots = [_plot(title, group, end_s) for title, group in lines.items()]
-    return _window(rrb.Horizontal(_space(title, points_mm, entities), rrb.Vertical(*plots)))
+    return _window(rrb.Horizontal(_space(title, view, entities), rrb.Vertical(*plots)))

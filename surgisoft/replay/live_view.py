@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,6 +43,7 @@ from surgisoft.replay.viewer import (
     web_address,
 )
 from surgisoft.units import actuation_word
+from surgisoft.viewpoint import upright
 
 LINE_MM = 2.0
 """Spacing of the drawn centreline's points (mm)."""
@@ -64,8 +65,6 @@ PAUSE_S = 2.0
 FLUSH_S = 30.0
 """Longest time that is waited for the view's last data to be written, s; rerun-sdk 0.41 would wait
 for ever where a disk is full."""
-STEEP = 0.7
-"""Share of the weight along the arm from which the arm is drawn upright or hanging, not lying."""
 EVENTS = "/events"
 """Entity of the text log."""
 LEGEND_TEXT = """- **white**: measured body
@@ -216,20 +215,6 @@ def _curve(points_mm: np.ndarray) -> np.ndarray:
     apart = np.linalg.norm(np.diff(points_mm, axis=0), axis=1) > 1e-6
     kept = points_mm[np.concatenate([[True], apart])]
     return finer(kept, LINE_MM).astype(np.float32) if len(kept) > 1 else kept.astype(np.float32)
-
-
-def upright(gravity: Sequence[float] | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(3,) unit vectors of a view in the arm's base frame: to the right, away from the eye, up.
-
-    Up is against the weight, so that a hanging arm hangs; an arm along z that is held across the
-    weight lies to the right. gravity: direction of the weight; None: -z.
-    """
-    down = np.array([0.0, 0.0, -1.0]) if gravity is None else np.asarray(gravity, np.float64)
-    up = -down / np.linalg.norm(down)
-    side = np.array([1.0, 0.0, 0.0]) if abs(up[2]) > STEEP else np.array([0.0, 0.0, 1.0])
-    side = side - (side @ up) * up
-    side /= np.linalg.norm(side)
-    return side, np.cross(up, side), up
 
 
 def live_blueprint(bench: LiveBench, end_s: float | None = None) -> rrb.Blueprint:

@@ -92,6 +92,7 @@ def _write(tables, title: str, path, seen: str, worst: list[Event], large_mm) ->
         seen="\n\n".join(filter(None, words)),
         events=events,
         large_mm=large_mm,
+        gravity=table.drawn_gravity,
     )
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Verdict
 from surgisoft.diagnosis.pages.diagnosis import effects_chart
-from surgisoft.diagnosis.pages.pictures import error_over_time, loops
+from surgisoft.diagnosis.pages.pictures import bodies, error_over_time, loops
 
 
 def test_rows_that_lack_a_key_point_do_not_pull_the_mean_down():
@@ -27,6 +27,43 @@ def test_rows_that_lack_a_key_point_do_not_pull_the_mean_down():
     np.testing.assert_allclose(mean.get_ydata(), 2.0)
     np.testing.assert_allclose(tip.get_ydata(), 4.0)
     np.testing.assert_array_equal(mean.get_xdata(), np.arange(0, 40, 2))
+    plt.close(figure)
+
+
+@pytest.mark.parametrize(
+    ("gravity", "up"),
+    [
+        (None, (0, 0, 1)),
+        ((0.0, 0.0, -1.0), (0, 0, 1)),
+        ((0.3, 0.0, 0.95), (0, 0, -1)),  # an arm that hangs, a little tilted
+        ((0.0, 1.0, 0.1), (0, -1, 0)),
+        ((-1.0, 0.0, 0.0), (1, 0, 0)),
+    ],
+)
+def test_postures_are_drawn_with_the_weight_downward(gravity, up):
+    """As rows of the projection say: up is up, and the picture is no mirror image."""
+    points = np.zeros((20, 2, 3))
+    middle = np.array([0.0, 0.0, 35.0])
+    points[:, 1] = 2 * middle + np.random.default_rng(0).uniform(-20, 20, (20, 3))
+    table = SimpleNamespace(
+        measured_mm=points,
+        predicted_mm=points + 1.0,
+        error_mm=np.full((20, 2), np.sqrt(3.0)),
+        spec=SimpleNamespace(key_points=1),
+        drawn_gravity=gravity,
+    )
+    figure = bodies({"predicted": table})
+    figure.canvas.draw()
+    axis = next(each for each in figure.axes if hasattr(each, "get_proj"))
+    projection = axis.get_proj()
+    heights = {}
+    for name, place in {"low": np.zeros(3), "high": 10.0 * np.array(up)}.items():
+        _, y, _, w = projection @ np.append(middle + place, 1.0)
+        heights[name] = y / w
+    assert heights["high"] > heights["low"]
+    axis.view_init(30.0, -60.0, 0.0, vertical_axis="z")
+    usual = axis.get_proj()
+    assert np.sign(np.linalg.det(projection)) == np.sign(np.linalg.det(usual))
     plt.close(figure)
 
 

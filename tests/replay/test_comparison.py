@@ -127,6 +127,37 @@ def test_the_title_of_a_view_states_the_rms_error(tmp_path, monkeypatch):
     assert "error 5 mm" in title
 
 
+@pytest.mark.parametrize("change", [False, True])
+@pytest.mark.parametrize(
+    ("gravity", "up"),
+    [(None, (0, 0, 1)), ((0.0, 0.0, 1.0), (0, 0, -1)), ((2.0, 0.0, 0.0), (-1, 0, 0))],
+)
+def test_the_weight_is_drawn_downward(change, gravity, up, tmp_path, monkeypatch):
+    """So that a hanging arm hangs; the eye is above the middle, and the bars are below the arm."""
+    eyes, controls = [], rrb.EyeControls3D
+
+    def noted(**given):
+        eyes.append(given)
+        return controls(**given)
+
+    monkeypatch.setattr(rrb, "EyeControls3D", noted)
+    t_s, measured, predicted = made_up()
+    path = tmp_path / "c.rrd"
+    if change:
+        write_change(t_s, measured, predicted, predicted - measured, "x", path, gravity)
+    else:
+        write_comparison(t_s, measured, predicted, "x", path, gravity=gravity)
+    (eye,) = eyes
+    np.testing.assert_allclose(eye["eye_up"], up, atol=1e-12)
+    points = measured[np.isfinite(measured).all(-1)]
+    assert (eye["position"] - eye["look_target"]) @ up > 0.0
+    if not change:
+        (bars,) = column(path, "/bars", "LineStrips3D:strips").values()
+        heights = np.array(bars).reshape(-1, 3) @ up
+        assert heights.max() < (points @ up).min() - 5.0
+        assert np.ptp(heights.reshape(2, 2), axis=1) == pytest.approx([0.0, 0.0], abs=1e-4)
+
+
 def test_the_scale_is_that_of_the_worst_model_in_round_numbers():
     body = np.zeros((40, 2, 3))
     body[:, 1, 2] = 70.0

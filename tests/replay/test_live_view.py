@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from surgisoft.replay.live_view import LiveBench, live_blueprint, live_view, upright
+from surgisoft.replay.live_view import LiveBench, live_blueprint, live_view
+from surgisoft.viewpoint import upright
 from tests.replay.reading import column, values_of
 
 

@@ -13,6 +13,7 @@ from surgisoft.error_scale import error_scale
 from surgisoft.files import new_file
 from surgisoft.palette import MEASURED_ON_LIGHT, RED, model_colour
 from surgisoft.time_axis import with_gaps
+from surgisoft.viewpoint import upright_axes
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt
@@ -194,7 +195,8 @@ def bodies(tables: dict[str, ResidualTable], title: str = ""):
 
     One column for each model, the same postures and one scale of the errors in all of them. Each
     error is an arrow from the measured key point towards the predicted one. The postures are far
-    apart and among those of larger error.
+    apart and among those of larger error. The weight of the first recording that states it is drawn
+    downward, so that a hanging arm hangs.
     """
     first = next(iter(tables.values()))
     scale = error_scale(first.measured_mm, [table.error_mm for table in tables.values()])
@@ -205,7 +207,9 @@ def bodies(tables: dict[str, ResidualTable], title: str = ""):
     colours = plt.get_cmap(ERROR_COLOURS)
     panels = []
     for number, (name, table) in enumerate(tables.items()):
-        axis = figure.add_subplot(1, count, number + 1, projection="3d")
+        axis: Any = figure.add_subplot(1, count, number + 1, projection="3d")
+        seen_from = upright_axes(first.drawn_gravity)
+        axis.view_init(**seen_from)
         panels.append(axis)
         line = table.model.backbone() if table.spec.key_points > 1 else None
         for place, row in enumerate(rows):
@@ -228,6 +232,10 @@ def bodies(tables: dict[str, ResidualTable], title: str = ""):
         axis.set_xlabel("x [mm]")
         axis.set_ylabel("y [mm]")
         axis.set_zlabel("z [mm]")
+        if seen_from["roll"]:  # else this label stands on its head
+            upward = getattr(axis, f"{seen_from['vertical_axis']}axis")
+            upward.set_rotate_label(False)
+            upward.label.set_rotation(90.0)
         axis.locator_params(axis="x", nbins=MOST_TICKS)
         axis.locator_params(axis="y", nbins=MOST_TICKS)
         known = table.error_mm[~np.isnan(table.error_mm)]

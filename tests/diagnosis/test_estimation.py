@@ -177,6 +177,44 @@ def test_an_interval_holds_a_further_draw_with_its_probability():
     assert said in found.in_words["payload"]
 
 
+@pytest.mark.parametrize("common", [0.5, 0.02])
+def test_zeros_of_which_only_differences_are_known_are_told_by_these(common):
+    """As on an arm that does not stretch, whose zeros have one part in common that moves nothing:
+    with independent shares of 0.01, values less their mean spread by 0.01 sqrt(2/3)."""
+    facts = default_arm().facts
+    effect = make_effect("zero_offset", facts)
+    values, small = np.array([0.05, -0.04, 0.02]), 0.01
+    spread = common**2 * np.ones((3, 3)) + small**2 * np.eye(3)
+    fit = Fit(
+        values=values,
+        jacobian=np.zeros((10, 1, 3, 3)),
+        residual=np.zeros((10, 1, 3)),
+        nuisance=None,
+        hold=np.zeros((3, 3)),
+        misfit=1.0,
+        prior_variance=np.zeros(3),
+    )
+    known = Fitted(fit, np.eye(3), spread)
+    names = {"zero_offset.offset": effect.offset}
+    (offset,) = intervals({"zero_offset": effect}, names, known).parameters
+    if common == 0.02:  # the values are known about as well as their differences
+        assert offset.relative == ()
+        assert "relative" not in offset.interval_text
+        return
+    (group,) = offset.relative
+    assert group.numbers == (1, 2, 3)
+    reach = (effect.reach * torch.ones(3)).numpy()
+    kPa = values * reach
+    np.testing.assert_allclose(group.value, kPa - kPa.mean(), rtol=1e-5)
+    half = np.subtract(group.high, group.low) / 2.0
+    np.testing.assert_allclose(half, 1.96 * small * np.sqrt(2.0 / 3.0) * reach, rtol=0.15)
+    assert "the values 1, 2 and 3 are known relative to each other: less their mean [" in (
+        offset.interval_text
+    )
+    assert offset.identifiable
+    assert offset.to_json()["identifiable"]
+
+
 def test_intervals_shrink_with_the_data():
     """Four times the rows, half the width (within sampling error), where the network is exact."""
     truth, widths = TRUTHS["gain_mismatch"], []

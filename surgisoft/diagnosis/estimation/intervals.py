@@ -24,11 +24,12 @@ at about the same misfit take their share of the draws.
 `surgisoft benchmark intervals` measures how often the intervals hold.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 from scipy.special import chdtrc, ndtri, stdtrit
 from torch import Tensor
 
@@ -47,8 +48,36 @@ NEGLIGIBLE = 1e-6
 reaches no zero, where its plausible range may begin."""
 NEARLY_ALL = 0.95
 """Share of the plausible range from which on an interval covers nearly all of it [-]."""
+RELATIVELY = 0.1
+"""Width of the interval of a difference, as a share of those of both values, up to which the values
+are said to be known relative to each other only [-]."""
 MOST_VALUES = 9
 """Most values of one quantity that are written out."""
+
+
+@dataclass(frozen=True)
+class Relative:
+    """Values of one quantity whose differences are known, unlike the values: their common part has
+    no effect on the arm, as that of the zeros of all channels of an arm that does not stretch."""
+
+    numbers: tuple[int, ...]
+    """Numbers of the values, from 1 on, as chambers are counted."""
+    value: tuple[float, ...]
+    """Each value less the mean of these."""
+    low: tuple[float, ...]
+    """Lower ends of the 95 % intervals of these."""
+    high: tuple[float, ...]
+    """Upper ends."""
+
+    @property
+    def text(self) -> str:
+        """What is known, in words."""
+        names = f"{', '.join(map(str, self.numbers[:-1]))} and {self.numbers[-1]}"
+        low, high = values_text(list(self.low)), values_text(list(self.high))
+        return (
+            f"the values {names} are known relative to each other: less their mean "
+            f"{values_text(list(self.value))} ({low} to {high})"
+        )
 
 
 @dataclass(frozen=True)
@@ -75,6 +104,8 @@ class Parameter:
     """Where the range comes from."""
     before: float | list | None = None
     """Value that the model had before; None where it lacked the effect."""
+    relative: tuple[Relative, ...] = ()
+    """Groups of its values whose differences are known far better than the values."""
 
     @property
     def may_be_plausible(self) -> bool:
@@ -91,11 +122,11 @@ class Parameter:
     def identifiable(self) -> bool:
         """Whether the recordings tell more of the value than its plausible range does.
 
-        They do not where the 95 % interval covers NEARLY_ALL of that range for every value:
-        practical non-identifiability (Raue et al. 2009), such as of a time constant of hours in a
-        recording of minutes.
+        They do not where the 95 % interval covers NEARLY_ALL of that range for every value and no
+        differences of values are known either (`relative`): practical non-identifiability (Raue et
+        al. 2009), such as of a time constant of hours in a recording of minutes.
         """
-        return not bool(np.all(self._covered >= NEARLY_ALL))
+        return bool(self.relative) or not bool(np.all(self._covered >= NEARLY_ALL))
 
     @property
     def _covered(self) -> np.ndarray:
@@ -122,7 +153,7 @@ class Parameter:
             return ""
         text = f"{values_text(self.low)} to {values_text(self.high)}"
         if self.identifiable:
-            return text
+            return "; ".join([text, *(each.text for each in self.relative)])
         least, most = self.plausible_range
         part = "all" if np.all(self._covered >= 1.0) else "nearly all"
         return (
@@ -263,7 +294,8 @@ def intervals(
     answer: list[Parameter] = []
     for name, effect in effects.items():
         for quantity in effect.quantities():
-            low, high = _ends([row[len(answer)] for row in seen])
+            drawn = [row[len(answer)] for row in seen]
+            low, high = _ends(drawn)
             answer.append(
                 Parameter(
                     effect=name,
@@ -275,6 +307,7 @@ def intervals(
                     plausible=quantity.plausible,
                     plausible_range=(quantity.low, quantity.high),
                     source=quantity.source,
+                    relative=tuple(_relative(quantity.value, drawn)),
                 )
             )
     ends, words = iter(zip(*_ends(read), strict=True)), {}
@@ -288,6 +321,28 @@ def _ends(drawn: list) -> list:
     """Ends of the 95 % interval of drawn values, each shaped as one of them."""
     values = np.array(drawn, dtype=np.float64)
     return np.quantile(values, [0.025, 0.975], axis=0, method="weibull").tolist()
+
+
+def _relative(value: float | list, drawn: list) -> Iterator[Relative]:
+    """Groups of a quantity's values that are known relative to each other only.
+
+    drawn: draws of the value, each shaped as it is.
+    """
+    values, draws = np.asarray(value, float), np.array(drawn, np.float64)
+    if values.ndim != 1 or len(values) < 2:
+        return
+    wide = np.ptp(_ends(drawn), axis=0)
+    apart = np.ptp(_ends((draws[:, :, None] - draws[:, None]).tolist()), axis=0)
+    near = (apart <= RELATIVELY * np.minimum.outer(wide, wide)) & (wide > 0.0)
+    count, group = connected_components(near | near.T, directed=False)
+    for number in range(count):
+        mine = np.flatnonzero(group == number)
+        if len(mine) < 2:
+            continue
+        low, high = _ends((draws[:, mine] - draws[:, mine].mean(axis=1, keepdims=True)).tolist())
+        shown = values[mine] - values[mine].mean()
+        numbers = tuple((mine + 1).tolist())
+        yield Relative(numbers, tuple(shown.tolist()), tuple(low), tuple(high))
 
 
 def beside_former(

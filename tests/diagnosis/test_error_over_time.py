@@ -94,6 +94,32 @@ def test_the_loops_of_many_chambers_keep_their_size(chambers):
     plt.close(figure)
 
 
+def test_a_chart_of_a_chamber_that_never_moves_alone_says_so():
+    """Three runs: chamber 1 alone; chamber 2 and half of the range of 3; both. 4 never moves."""
+    rise, still = np.linspace(0.0, 1.0, 100), np.zeros(100)
+    chambers = ([rise, still, still], [still, rise, rise], [still, 0.5 * rise, rise])
+    pressure = np.stack([*map(np.concatenate, chambers), np.full(300, 3.0)], axis=1)
+    points = np.zeros((300, 2, 3))
+    points[:, -1, 0] = pressure @ [10.0, 5.0, 5.0, 0.0]
+    table = SimpleNamespace(
+        pressure=pressure,
+        measured_mm=points,
+        predicted_mm=points,
+        run=np.repeat([0, 1, 2], 100),
+    )
+    figure = loops(table, "kPa")
+    titles = {
+        axis.get_xlabel(): axis.get_title() for axis in reversed(figure.axes) if axis.get_xlabel()
+    }
+    plt.close(figure)
+    assert titles == {
+        "chamber 1 [kPa]": "",
+        "chamber 2 [kPa]": "others move too: 50 % of their range",
+        "chamber 3 [kPa]": "others move too: 100 % of their range",
+        "chamber 4 [kPa]": "does not move",
+    }
+
+
 def test_the_chart_of_effects_fills_the_page():
     """The page is 1072 px wide inside its margins, and an inch is 96 px."""
     found = Diagnosis(Verdict("unknown_effect", (), "unknown"), ErrorLevels(1.0, 0.1, 0.5), ())

@@ -58,7 +58,11 @@ HOW = (
     "noise floor may be noise, or more than could be learned from these recordings."
 )
 PICTURES = {
-    "loops": "Tip against actuation, measured and predicted; below, less what actuation explains",
+    "loops": (
+        "Tip against actuation, measured and predicted, in the rows in which each chamber moves "
+        "most and the others least; where these move too, the upper chart shows their motion as "
+        "well. Below, less what the actuation of all chambers explains"
+    ),
     "body": "The whole body in a few postures, with magnified errors",
     "error": "The error over time",
 }

@@ -23,6 +23,9 @@ LOOP_ROWS = 160
 """Most rows that one picture of loops shows; more would hide each other."""
 LADDER_ROWS = 400
 """Rows of the ladder's picture, in which one chamber moves alone."""
+ALONE = 0.2
+"""Motion of the other chambers, as a share of the chamber's own, both in shares of their ranges, up
+to which it counts as moving alone."""
 LOOPS_ABREAST = 3
 """Most chambers whose loops stand side by side: with more, a page shows their text too small."""
 LOOPS_IN, LOOPS_HIGH_IN = 3.2, 2.5
@@ -107,8 +110,9 @@ def _lone_motion(table: ResidualTable) -> np.ndarray:
 def loops(table: ResidualTable, unit: str, title: str = ""):
     """Tip against the actuation of each chamber, measured and predicted.
 
-    For each chamber the stretch of rows in which it moves most and the others least. Below, the
-    best polynomial in all pressures is taken out of both: what is left has memory, or noise.
+    For each chamber the stretch of rows in which it moves most and the others least; where they
+    move, too, a line above the chart says by how much. Below, the best polynomial in all pressures
+    is taken out of both: what is left has memory, or noise.
     """
     chambers = table.pressure.shape[1]
     bands = -(-chambers // LOOPS_ABREAST)
@@ -128,6 +132,7 @@ def loops(table: ResidualTable, unit: str, title: str = ""):
         measured, predicted = table.measured_mm[:, -1] @ along, table.predicted_mm[:, -1] @ along
         static = _static(table.pressure, measured)
         pressure = table.pressure[rows, chamber]
+        axes[2 * band, column].set_title(_beside(table.pressure, rows, chamber), fontsize="small")
         for row, (offset, what) in enumerate(
             (
                 (0 * static, "tip, main\ndirection [mm]"),
@@ -145,6 +150,19 @@ def loops(table: ResidualTable, unit: str, title: str = ""):
                 axis.set_ylabel(what)
     axes[0, 0].legend(frameon=False)
     return figure
+
+
+def _beside(pressure: np.ndarray, rows: np.ndarray, chamber: int) -> str:
+    """What one cannot see of a chamber's chart: that the others move in these rows, too, so that
+    the tip does not follow this chamber alone; empty where they hardly do."""
+    span = np.ptp(pressure, axis=0)
+    moves = np.ptp(pressure[rows], axis=0) / np.where(span > 0, span, 1)
+    most = np.delete(moves, chamber).max(initial=0.0)
+    if moves[chamber] == 0.0:
+        return "does not move"
+    if most <= ALONE * moves[chamber]:
+        return ""
+    return f"others move too: {100 * most:.0f} % of their range"
 
 
 def _stretch(table: ResidualTable, chamber: int, longest: int = LOOP_ROWS) -> np.ndarray:

@@ -170,7 +170,7 @@ def batched_env(
     num_envs: int,
     seed: int = 0,
     config: Any = None,
-    device: str | torch.device = "cpu",
+    device: str | torch.device | None = None,
     scene: str | Path | None = None,
     arm: str | Path | None = None,
     geometry: str | None = None,

@@ -171,10 +171,10 @@ class SurgicalEnv(ParallelEnv):
 def parallel_env(
     task: str | Task,
     config: Any = None,
-    device: str | torch.device = "cpu",
+    device: str | torch.device | None = None,
     scene: str | Path | None = None,
     arm: str | Path | None = None,
-    geometry: str = "fcl",
+    geometry: str | None = None,
     render_mode: str | None = None,
     images: str | None = None,
     image_pixels: int | None = None,
@@ -185,14 +185,18 @@ def parallel_env(
     the commanded pressure, kPa, both float32. Raises InputError for an unknown task, scene or
     field.
 
-    task: its name, or a task that is built already, which takes no config, scene, arm or images.
-    config: the task's whole config, None: its default one. scene: a scene's folder. arm: an arm
-    model's folder or `default`. None leaves scene or arm as the config has it. geometry: `fcl`, the
-    exact collision checker, or `batched`, the faster engine of training, for contact and for the
-    beam's hit; near contact the two agree to 0.1 mm. render_mode: `rgb_array`, for pictures by
-    `render`, or None. images: `rgb`, `depth`, `segmentation` with commas in between: what the
-    endoscope shows, in observations that are then dicts; image_pixels: its width and height.
+    task: its name, or a task that is built already, which takes no config, scene, arm or images,
+    and no other device or geometry. device: default `cpu`, of a built task its own. config: the
+    task's whole config, None: its default one. scene: a scene's folder. arm: an arm model's folder
+    or `default`. None leaves scene or arm as the config has it. geometry: `fcl`, the exact
+    collision checker and the default of a named task, or `batched`, the faster engine of training,
+    for contact and for the beam's hit; near contact the two agree to 0.1 mm. render_mode:
+    `rgb_array`, for pictures by `render`, or None. images: `rgb`, `depth`, `segmentation` with
+    commas in between: what the endoscope shows, in observations that are then dicts; image_pixels:
+    its width and height.
     """
+    if geometry is None and isinstance(task, str):
+        geometry = "fcl"
     built = task_of(
         task, device, config=config, scene=scene, arm=arm, geometry=geometry, images=images,
         image_pixels=image_pixels,

@@ -216,20 +216,26 @@ def make_with(
     return make_task(name, with_fields(config, **given), device_of(device))
 
 
-def task_of(task: str | Task, device: str | torch.device = "cpu", **changes: Any) -> Task:
+def task_of(task: str | Task, device: str | torch.device | None = None, **changes: Any) -> Task:
     """The named task with changes as for `make_with`, or a task that is built already.
 
     The latter has its own configuration, device and geometry. Raises InputError for another object,
-    and for a change of the configuration beside a built task.
+    and for a change of the configuration, or another device or geometry, beside a built task.
+    device: None: the task's own, of a named task the CPU.
     """
     if isinstance(task, str):
-        return make_with(task, device=device, **changes)
+        return make_with(task, device="cpu" if device is None else device, **changes)
     if not hasattr(task, "world"):
         raise InputError(
             f"task is of type {type(task).__name__}, expected the name of a task or a task; "
             "check the order of the arguments"
         )
-    beside = [name for name in changes if name != "geometry" and changes[name] is not None]
+    beside = [name for name in changes if changes[name] is not None]
+    engine = getattr(getattr(task.world, "config", None), "scene_engine", None)
+    if "geometry" in beside and changes["geometry"] == getattr(engine, "geometry", None):
+        beside.remove("geometry")
+    if device is not None and device_of(device).type != task.world.device.type:
+        beside.append("device")
     if beside:
         raise InputError(
             f"{beside[0]} is given beside the task '{task.name}', which is built already; build "

@@ -54,6 +54,23 @@ def test_every_environment_is_made_of_a_task_too(make):
     for field in ("config", "arm", "images"):
         with pytest.raises(InputError, match=f"{field} is given beside the task 'track_circle'"):
             make(task, **{field: "default"})
+    assert task.world.config.scene_engine.geometry == "batched"
+    make(task, geometry="batched", device="cpu")
+    with pytest.raises(InputError, match="geometry is given beside the task 'track_circle'"):
+        make(task, geometry="fcl")
+
+
+@pytest.mark.parametrize("make", MAKES, ids=["parallel", "batched", "single", "vector"])
+def test_another_device_beside_a_task_is_refused(make, monkeypatch):
+    """The task stays where it was built; which GPU is asked for is not looked at."""
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    with pytest.raises(InputError, match="device is given beside the task 'track_circle'"):
+        make(make_task("track_circle"), device="cuda")
+
+
+def test_the_exact_geometry_is_the_default_of_a_named_task():
+    task = surgisoft.parallel_env("track_circle").task
+    assert task.world.config.scene_engine.geometry == "fcl"
 
 
 def test_a_gpu_that_is_not_there_is_one_line(monkeypatch):

@@ -146,7 +146,8 @@ def check(
     found = settings(spec)
     with progress("experiment check") as report:
         clear_mm = check_playable(spec, progress=report)
-    for line in (*beams_beyond_limits(spec), *weak_lasers(spec), *about_policies(spec)):
+        lasers = weak_lasers(spec, report)
+    for line in (*beams_beyond_limits(spec), *lasers, *about_policies(spec)):
         warn(line)
     episodes = counted(len(found) * spec.repeats, "episode")
     print(

@@ -258,7 +258,7 @@ def finish_experiment(
         notes.append(text)
         on_warning(text)
 
-    for line in (*beams_beyond_limits(spec), *weak_lasers(spec), *about_policies(spec)):
+    for line in (*beams_beyond_limits(spec), *weak_lasers(spec, progress), *about_policies(spec)):
         note(line)
     rows = run_experiment(spec, folder, processes, progress, cluster, note)
     results = sum_up(spec, folder, rows)
@@ -293,11 +293,12 @@ def beams_beyond_limits(spec: Experiment) -> list[str]:
     return found
 
 
-def weak_lasers(spec: Experiment) -> list[str]:
+def weak_lasers(spec: Experiment, progress: Progress = silent) -> list[str]:
     """See `weak_laser`: one line for each different task whose beam, in the phases that have one,
     is too weak to treat what a success needs.
 
-    Of many settings `MOST_LASERS` are looked at, evenly; equal lines are one.
+    Of many settings `MOST_LASERS` are looked at, evenly; equal lines are one. progress: called with
+    (settings looked at, settings to look at, note).
     """
     beam_s = sum(phase.timeout_s for phase in spec.phases if phase.beam)
     if not spec.in_scene or not beam_s:
@@ -308,8 +309,9 @@ def weak_lasers(spec: Experiment) -> list[str]:
         place = scene_folder(spec, setting.case)
         different.setdefault((place, setting.lesion, values), replace(setting, values=values))
     said: dict[str, list[str]] = {}
-    number = -(-len(different) // MOST_LASERS)
-    for setting in list(different.values())[::number]:
+    looked_at = list(different.values())[:: -(-len(different) // MOST_LASERS)]
+    for number, setting in enumerate(looked_at):
+        progress(number, len(looked_at), f"dose of the laser, {setting.words}")
         simulated = replace(setting, case=replace(setting.case, plant="simulation"))
         try:
             base = build_task(spec, simulated, on_warning=None).base

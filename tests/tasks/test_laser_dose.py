@@ -10,6 +10,7 @@ import torch
 
 from surgisoft.agents.session import evaluate
 from surgisoft.cli import run
+from surgisoft.experiments.session import open_experiment, weak_lasers
 from surgisoft.scene.ablation import AblationMap, line_dose_j_per_mm2
 from surgisoft.scene.dose_patch import path_patch
 from surgisoft.scene.folder import open_scene
@@ -129,6 +130,10 @@ def test_the_commands_warn_of_a_weak_laser(tmp_path, capsys):
     text = TINY.replace("{scene}", str(place))
     vary = '[[vary]]\nfield = "task.cut_s"\nvalues = [45.0, 450.0]\n'
     experiment = write(tmp_path, text.replace("time_s = 0.5", "time_s = 500.0") + vary)
+    reported = []
+    assert len(weak_lasers(open_experiment(experiment), lambda *one: reported.append(one))) == 1
+    assert [one[:2] for one in reported] == [(0, 2), (1, 2)]
+    assert reported[1][2].startswith("dose of the laser, ")
     assert run(["experiment", "check", str(experiment)]) == 0
     said = [line for line in capsys.readouterr().err.splitlines() if "J/mm2" in line]
     assert len(said) == 1, "450 s are enough"

@@ -698,6 +698,7 @@ def test_an_experiment_that_takes_something_away_is_told_by_hand(
     commands = SimpleNamespace(commands=np.zeros((2, 3)), unit="kPa", run_rows=[2])
     fields = {
         "name": "walk", "minutes": 5.0, "why": "it tells them apart", "steps": ["unmount it"],
+        "chances_in_words": "a chance counts the noise",
         "protocol": commands, "options": "--payload 5", "removes": ("payload",), "pairs": [pair],
         "separates": [], "open": (), "paired": False,
     }  # fmt: skip
@@ -728,6 +729,7 @@ def test_an_experiment_that_takes_something_away_is_told_by_hand(
         assert (f" {rec} NEW.parquet" in out) is not by_hand
         assert ("--without payload" in out) is by_hand
         assert "creep or payload: expected chance of the right one 0.50 -> 0.90" in out
+        assert "\na chance counts the noise\n" in out
         command = ["next-experiment", "lab", rec, "--predictions", "old.csv", "-o", new]
         out = printed(capsys, monkeypatch, target, plan, *command)
         Path(new).unlink()

@@ -144,6 +144,7 @@ ROOMS = {
         "arrangements",
         "search",
         "words",
+        "mixed_units",
         "blind",
         "correction",
         "result",

@@ -19,6 +19,7 @@ from surgisoft.diagnosis.setup.arrangements import mistaken
 from surgisoft.diagnosis.setup.blind import Blind, blind_channel
 from surgisoft.diagnosis.setup.channels import Dead, dead_channels
 from surgisoft.diagnosis.setup.correction import Correction
+from surgisoft.diagnosis.setup.mixed_units import MixedUnits, mixed_units
 from surgisoft.diagnosis.setup.sample import Arrangement, sample_of, samples_of
 from surgisoft.diagnosis.setup.search import (
     PROOF,
@@ -205,7 +206,11 @@ def _of_one_setup(model: ArmModel, recordings: list[Recording]) -> SetupResult |
     """The faults of recordings that share them."""
     levels = _levels(model, recordings)
     dead, masked, commanded = dead_channels(model.spec, recordings)
-    search, found = _search(model, masked, levels).likelier_clock()
+    search = _search(model, masked, levels)
+    mixed = mixed_units(search.coarse)
+    if mixed is not None:
+        return _of_mixed_units(model, recordings, mixed, levels)
+    search, found = search.likelier_clock()
     taken: tuple[int, ...] = ()
     blind: Blind | None = None
     if dead.chambers and search.noticed:
@@ -220,6 +225,29 @@ def _of_one_setup(model: ArmModel, recordings: list[Recording]) -> SetupResult |
         if not taken and found is None and len(dead.chambers) == 1:
             blind = blind_channel(search, dead.chambers[0])
     return _Report(model, recordings, search, found, dead, taken, blind).result()
+
+
+def _of_mixed_units(
+    model: ArmModel, recordings: list[Recording], mixed: MixedUnits, levels: Levels
+) -> SetupResult:
+    """The result for key points in another unit: nothing else is tested, because all that was
+    found beside them would be wrong."""
+    fault, unit = mixed.fault, model.spec.unit
+    as_recorded = Arrangement.as_recorded(model.spec.chambers)
+    return SetupResult(
+        faults=(fault,),
+        alternatives=(),
+        sentence=fault.sentence,
+        instructions=mixed.instructions,
+        alternative_instructions=(),
+        how_to_tell="",
+        before_mm=mixed.before_mm,
+        after_mm=mixed.after_mm,
+        floor_mm=levels.told_noise,
+        recordings=tuple(recording.name for recording in recordings),
+        correctable=False,
+        correction=Correction(as_recorded, tuple(range(model.spec.key_points)), unit, unit),
+    )
 
 
 def _search(model: ArmModel, recordings: list[Recording], levels: Levels) -> Search:

@@ -44,7 +44,7 @@ def test_key_points_that_are_right_are_in_no_other_unit():
     arm, right = default_arm(), measured()
     assert find_setup_faults(arm, [right]) is None
     assert find_setup_faults(arm, [scaled(right, (0,), 0.1)]) is None, "the base is at the origin"
-    bumped = turned(right, (0.03, -0.04, 0.02), (8.0, -5.0, 2.0))
+    bumped = turned(right, (0.0, 0.0, 0.0), (1.6, 0.0, 0.0))
     assert find_setup_faults(arm, [bumped]) is None, "a large ratio takes the base back to it"
 
 

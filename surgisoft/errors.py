@@ -17,6 +17,8 @@ SHOWN = 160
 """Most characters of a foreign exception's text in a message."""
 PACKAGE = Path(__file__).parent
 """Folder of this package."""
+STUDIES = PACKAGE.parent / "benchmarks"
+"""Folder of the project's own studies, whose exceptions are no user's either."""
 STANDARD = Path(os.__file__).parent
 """Folder of Python's standard library."""
 INSTALLED = {"site-packages", "dist-packages"}
@@ -90,7 +92,7 @@ def raised_at(error: BaseException, file: str = "") -> str:
     """An exception of foreign code in words: `ValueError in bad.py line 3: mesh is missing`.
 
     file: the last line in this file is stated, not the last one in a library that it calls; without
-    it, the last line outside this package, the standard library and `LIBRARIES`, if there is one.
+    it, the last line outside this project, the standard library and `LIBRARIES`, if there is one.
     """
     if isinstance(error, SyntaxError) and error.filename:
         return (
@@ -116,9 +118,9 @@ def own_file(error: BaseException, offered: Iterable[str] = ()) -> str:
 
 
 def _is_foreign(file: str) -> bool:
-    """Whether a file of code lies outside this package, the standard library and `LIBRARIES`."""
+    """Whether a file of code lies outside this project, the standard library and `LIBRARIES`."""
     path = Path(file)
-    if file.startswith("<") or path.is_relative_to(PACKAGE):
+    if file.startswith("<") or path.is_relative_to(PACKAGE) or path.is_relative_to(STUDIES):
         return False
     if package := _installed_package(file):
         return package not in LIBRARIES

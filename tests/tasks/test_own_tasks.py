@@ -218,3 +218,10 @@ def test_an_exception_of_this_package_keeps_its_traceback(monkeypatch):
     monkeypatch.setattr("surgisoft.tasks.registry.MOST_STEPS", None)
     with pytest.raises(TypeError):
         run(["evaluate", "scripted", "--task", "track_circle"])
+
+
+def test_an_exception_of_a_study_of_the_project_keeps_its_traceback(monkeypatch, tmp_path):
+    """A study lies beside the package."""
+    monkeypatch.setattr("benchmarks.setup_faults.workers", None)
+    with pytest.raises(TypeError):
+        run(["benchmark", "setup-faults", "--work", str(tmp_path)])

@@ -42,12 +42,13 @@ def begin_worker(prepared: Path | None = None) -> None:
 
     The worker also ends when the parent is killed: the system then closes the pipe that is waited
     for. prepared: file with the pickled function that is called in the new process, which begins
-    without the state of its parent.
+    without the state of its parent. Torch, which takes more than a second to import, is left to the
+    work that needs it, and then reads `ONE_THREAD`.
     """
-    import torch
-
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    torch.set_num_threads(1)
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
     parent = multiprocessing.parent_process()
     if parent is None:
         raise RuntimeError("begin_worker is for a new process, and this is the first one")

@@ -85,9 +85,9 @@ MISSING = {
 
 @pytest.fixture(scope="module")
 def said(tmp_path_factory):
-    """What a part of the package, a function and these commands say, one after another in one program.
+    """What a part of the package, a function and these commands say, one after another.
 
-    Before the commands the program records, compares and diagnoses, as the lines of the README do.
+    Before the commands the program, the same one for all, records, compares and diagnoses, as the lines of the README do.
     """
     done = core(
         """

@@ -17,7 +17,6 @@ from surgisoft.agents.run_folder import RunFolder
 from surgisoft.cli import run
 from tests.report.browser import chromium, look
 
-
 SHORT = ["follow.loop_s=2", "follow.approach_s=0.5"]
 """Fields of `track_circle` with which an episode has 25 steps."""
 

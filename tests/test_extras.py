@@ -87,7 +87,8 @@ MISSING = {
 def said(tmp_path_factory):
     """What a part of the package, a function and these commands say, one after another.
 
-    Before the commands the program, the same one for all, records, compares and diagnoses, as the lines of the README do.
+    One program says it all. Before the commands it records, compares and diagnoses, as the lines
+    of the README do.
     """
     done = core(
         """

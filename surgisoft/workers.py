@@ -44,13 +44,11 @@ def begin_worker(prepared: Path | None = None) -> None:
     for. prepared: file with the pickled function that is called in the new process, which begins
     without the state of its parent.
     """
-    import torch
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    torch.set_num_threads(1)
     parent = multiprocessing.parent_process()
     if parent is None:
         raise RuntimeError("begin_worker is for a new process, and this is the first one")
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _compute_on_one_thread()
     parent_exit = parent.sentinel
 
     def end_with_parent() -> None:
@@ -60,6 +58,17 @@ def begin_worker(prepared: Path | None = None) -> None:
     threading.Thread(target=end_with_parent, daemon=True).start()
     if prepared is not None:
         pickle.loads(prepared.read_bytes())()
+
+
+def _compute_on_one_thread() -> None:
+    """Let torch have one thread in this process.
+
+    It takes more than a second to import, so it is left to the work that needs it, and then reads
+    `ONE_THREAD`.
+    """
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
 
 
 @contextlib.contextmanager
@@ -261,9 +270,7 @@ def _begin_plugin(prepare: Callable[[], object] | None) -> Any:
         name = "surgisoft"
 
         def setup(self, worker: Any) -> None:
-            import torch
-
-            torch.set_num_threads(1)
+            _compute_on_one_thread()
             if prepare is not None:
                 prepare()
 

@@ -16,6 +16,7 @@ from surgisoft.demonstration import story
 from surgisoft.errors import InputError
 from surgisoft.files import write_atomically
 from surgisoft.measurement.recordings import load_recordings
+from surgisoft.replay import comparison
 from surgisoft.replay.episode_view import write_replay
 from surgisoft.report import Text
 from surgisoft.surrogate.checkpoint import load_model
@@ -25,9 +26,10 @@ def test_five_steps_with_their_pictures(tmp_path, monkeypatch, capsys):
     """On a shorter recording; the packaged policies cut, the hidden effect is found and added.
 
     They go around in a third of the time that they were trained for, which is harder. The picture
-    of the replay is a small one, and the replay has a tenth of the endoscope's pictures:
-    `tests/replay` has those of the viewer, and whole replays.
+    of the replay is a small one, and replays have a tenth of the endoscope's pictures and of the
+    bodies: `tests/replay` has those of the viewer, and whole replays.
     """
+    monkeypatch.setattr(comparison, "MOST_ROWS", 80)
     monkeypatch.setattr(story, "POINTS", 800)
     quick = replace(RunFolder(story.POLICY).plan().task_config, cut_s=15.0)
     monkeypatch.setattr(story, "evaluate", partial(evaluate, config=quick))

@@ -85,14 +85,20 @@ MISSING = {
 
 @pytest.fixture(scope="module")
 def said(tmp_path_factory):
-    """What a function and these commands say, one after another in one program.
+    """What a part of the package, a function and these commands say, one after another.
 
-    Before that the program records, compares and diagnoses, as the lines of the README do.
+    One program says it all. Before the commands it records, compares and diagnoses, as the lines
+    of the README do.
     """
     done = core(
         """
 import contextlib, io, json
 from pathlib import Path
+said = {}
+try:
+    import surgisoft.agents.policies
+except ImportError as error:
+    said["part"] = [1, str(error)]
 import surgisoft
 bench = Path(sys.argv.pop(1)) / "bench.parquet"
 recording = surgisoft.collect("mixed", seed=0, points=300)
@@ -100,7 +106,6 @@ surgisoft.save_recording(recording, bench)
 comparison, _ = surgisoft.compare("default", [bench])
 print(comparison.rmse_mm > 0)
 print(surgisoft.diagnose("default", [bench]).verdict.kind)
-said = {}
 try:
     surgisoft.parallel_env
 except ImportError as error:
@@ -154,13 +159,10 @@ def test_python_names_the_extra_too(said):
     assert "pip install 'surgisoft[train]'" in said["python"][1]
 
 
-def test_a_part_of_the_package_names_its_extra_too():
-    """Imported by itself, by a program that passes no function of the package."""
-    done = core("import surgisoft.agents.policies")
-    assert done.returncode == 1
-    last = done.stderr.splitlines()[-1]
-    assert "the package 'embreex' is missing" in last
-    assert "pip install 'surgisoft[scene]'" in last
+def test_a_part_of_the_package_names_its_extra_too(said):
+    """Imported by itself, before the program has called any function of the package."""
+    assert "the package 'embreex' is missing" in said["part"][1]
+    assert "pip install 'surgisoft[scene]'" in said["part"][1]
 
 
 def of_metadata(monkeypatch, package, installed, asked):

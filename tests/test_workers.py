@@ -107,22 +107,28 @@ def test_an_error_gives_up_what_is_waiting():
     assert time.monotonic() - begin < 30.0
 
 
+def own_threads() -> tuple[int, int]:
+    """Threads of torch in this process, imported before it was prepared (0: not) and now."""
+    early = "torch" in sys.modules and sys.modules["torch"].get_num_threads()
+    import torch
+
+    return int(early), torch.get_num_threads()
+
+
 def test_workers_compute_on_one_thread(monkeypatch):
+    """Ctrl-C is held back before `begin_worker` runs: the process is born with it blocked. Torch is
+    left to work that needs it."""
     monkeypatch.setenv(ONE_THREAD[0], "7")
     monkeypatch.delenv(ONE_THREAD[1], raising=False)
     with workers(1) as pool:
+        if hasattr(signal, "pthread_sigmask"):
+            held = pool.submit(signal.pthread_sigmask, signal.SIG_BLOCK, []).result()
+            assert signal.SIGINT in held
+            assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
         assert [pool.submit(os.getenv, name).result() for name in ONE_THREAD] == ["1"] * 3
+        assert pool.submit(own_threads).result() == (0, 1)
     assert os.environ[ONE_THREAD[0]] == "7"
     assert ONE_THREAD[1] not in os.environ
-
-
-@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="no signal masks here")
-def test_ctrl_c_does_not_reach_a_worker_that_starts():
-    """It is held back before `begin_worker` runs: the process is born with it blocked."""
-    with workers(1) as pool:
-        held = pool.submit(signal.pthread_sigmask, signal.SIG_BLOCK, []).result()
-    assert signal.SIGINT in held
-    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
 def spent_by_other_threads() -> list[float]:

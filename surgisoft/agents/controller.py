@@ -417,6 +417,8 @@ def _where(mask: Tensor, yes: Any, no: Any) -> Any:
     """`yes` where the (1,) mask holds, else `no`: for each tensor of two pytrees."""
 
     def pick(a: Tensor, b: Tensor) -> Tensor:
+        if a is b:
+            return a
         this = mask.view(-1, *[1] * (a.ndim - 1))
         if a.dtype == torch.bool:  # onnxruntime implements no Where of booleans
             return (this & a) | (~this & b)

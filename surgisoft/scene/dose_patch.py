@@ -448,28 +448,47 @@ def _ring_coordinates(points, ring, normals, centre, steps):
 
 @compiled
 def _nearest_on_line(points, ring, normals, steps, along, offset, side):
-    """Nearest point of the polyline: its arc length, the distance, and on which side."""
+    """Nearest point of the polyline: its arc length, the distance, and on which side.
+
+    A step that begins farther away than the nearest one so far and its own length is passed over.
+    """
     count = len(ring) - 1
+    squared = np.empty(count)
+    for m in range(count):
+        ex, ey, ez = (
+            ring[m + 1, 0] - ring[m, 0],
+            ring[m + 1, 1] - ring[m, 1],
+            ring[m + 1, 2] - ring[m, 2],
+        )
+        squared[m] = max(ex * ex + ey * ey + ez * ez, 1e-300)
     for p in range(len(points)):
-        best, arc = np.inf, 0.0
+        best, reach, arc = np.inf, np.inf, 0.0
         for m in range(count):
             k = m + 1
-            ex, ey, ez = ring[k, 0] - ring[m, 0], ring[k, 1] - ring[m, 1], ring[k, 2] - ring[m, 2]
             x, y, z = (
                 points[p, 0] - ring[m, 0],
                 points[p, 1] - ring[m, 1],
                 points[p, 2] - ring[m, 2],
             )
-            share = (x * ex + y * ey + z * ez) / max(ex * ex + ey * ey + ez * ez, 1e-300)
-            share = min(max(share, 0.0), 1.0)
-            x, y, z = x - share * ex, y - share * ey, z - share * ez
-            d2 = x * x + y * y + z * z
-            if d2 < best:
-                best = d2
-                along[p] = arc + share * steps[m]
-                nx, ny = normals[m, 0] + normals[k, 0], normals[m, 1] + normals[k, 1]
-                nz = normals[m, 2] + normals[k, 2]
-                side[p] = nx * (ey * z - ez * y) + ny * (ez * x - ex * z) + nz * (ex * y - ey * x)
+            far = reach + steps[m]
+            if x * x + y * y + z * z <= far * far:
+                ex, ey, ez = (
+                    ring[k, 0] - ring[m, 0],
+                    ring[k, 1] - ring[m, 1],
+                    ring[k, 2] - ring[m, 2],
+                )
+                share = (x * ex + y * ey + z * ez) / squared[m]
+                share = min(max(share, 0.0), 1.0)
+                x, y, z = x - share * ex, y - share * ey, z - share * ez
+                d2 = x * x + y * y + z * z
+                if d2 < best:
+                    best, reach = d2, (1.0 + 1e-9) * np.sqrt(d2)
+                    along[p] = arc + share * steps[m]
+                    nx, ny = normals[m, 0] + normals[k, 0], normals[m, 1] + normals[k, 1]
+                    nz = normals[m, 2] + normals[k, 2]
+                    side[p] = (
+                        nx * (ey * z - ez * y) + ny * (ez * x - ex * z) + nz * (ex * y - ey * x)
+                    )
             arc += steps[m]
         offset[p] = np.sqrt(best)
 

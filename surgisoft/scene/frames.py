@@ -38,6 +38,13 @@ def _as_tensor(value, like: torch.Tensor) -> torch.Tensor:
     return torch.as_tensor(value, dtype=like.dtype, device=like.device)
 
 
+def _parts(vectors):
+    """The three components (...) of (..., 3) vectors."""
+    if isinstance(vectors, torch.Tensor):  # one operation; an index for each would be three
+        return vectors.unbind(-1)
+    return vectors[..., 0], vectors[..., 1], vectors[..., 2]
+
+
 def norm(vector: Array) -> Array:
     """Euclidean length of (..., 3) vectors: (...)."""
     return _library(vector).sqrt(dot(vector, vector))
@@ -51,14 +58,14 @@ def normalise(vector: Array) -> Array:
 
 def cross(a: Array, b: Array) -> Array:
     """Cross product of (..., 3) vectors, broadcast."""
-    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
-    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    (ax, ay, az), (bx, by, bz) = _parts(a), _parts(b)
     return _library(a).stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), -1)
 
 
 def dot(a: Array, b: Array) -> Array:
     """Dot product of (..., 3) vectors, broadcast: (...)."""
-    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+    x, y, z = _parts(a * b)
+    return x + y + z
 
 
 def pose_from(rotation: Array, position_mm: Array) -> Array:

@@ -114,6 +114,10 @@ def circle_on(
     return Ring(np.asarray(centre_mm), normal, points, normals, faces)
 
 
+MOST_PAIRS = 200_000
+"""Pairs of a line and a face that are looked at together (a count): some ten megabytes."""
+
+
 def dropped(
     mesh: Mesh, flat: np.ndarray, centre: np.ndarray, normal: np.ndarray, diameter: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -133,17 +137,20 @@ def dropped(
     z = local[near, :, 2]
     heights, faces = np.zeros(len(flat)), np.full(len(flat), -1)
     area = _cross2(b - a, c - a)
-    for i, point in enumerate(plane[:, :2]):
+    slack = -1e-9 * area
+    block = max(1, MOST_PAIRS // max(1, len(near)))
+    for begin in range(0, len(flat), block):
+        point = plane[begin : begin + block, None, :2]
         u = _cross2(b - point, c - point)
         v = _cross2(c - point, a - point)
         w = area - u - v
-        slack = -1e-9 * area
-        hit = np.flatnonzero((u >= slack) & (v >= slack) & (w >= slack) & (area > 0.0))
-        if not len(hit):
-            continue
-        height = (u[hit] * z[hit, 0] + v[hit] * z[hit, 1] + w[hit] * z[hit, 2]) / area[hit]
-        lowest = np.argmin(np.abs(height))
-        heights[i], faces[i] = height[lowest], near[hit[lowest]]
+        row, hit = np.nonzero((u >= slack) & (v >= slack) & (w >= slack) & (area > 0.0))
+        u, v, w = (each[row, hit] for each in (u, v, w))
+        height = (u * z[hit, 0] + v * z[hit, 1] + w * z[hit, 2]) / area[hit]
+        order = np.lexsort((hit, np.abs(height), row))  # the lowest of each row first
+        row, first = np.unique(row[order], return_index=True)
+        lowest = order[first]
+        heights[begin + row], faces[begin + row] = height[lowest], near[hit[lowest]]
     return heights, faces
 
 

@@ -13,6 +13,11 @@ from torch import Tensor
 from surgisoft.tasks.world.arm import Arm, ArmPart
 from surgisoft.tasks.world.pytree import rows, tree_map
 
+SOLVED_MM = 5e-5
+"""Largest residual of a solution, mm. Coordinates of 100 mm in single precision are 8e-6 mm apart,
+and the axis of a tip, which a beam follows over tens of millimetres, amplifies that several times;
+further steps would follow rounding alone."""
+
 
 def least_squares(
     residual: Callable[[Tensor], Tensor],
@@ -21,52 +26,52 @@ def least_squares(
     high: Tensor,
     damping: float = 1e-3,
     iterations: int = 5,
+    solved: float = 0.0,
 ) -> Tensor:
     """Minimise residuals (B, r) over (B, m) within low, high (B, m); returns the best point tried.
 
     Steps (J^T J + lambda D)^-1 J^T r with D the mean of J^T J's diagonal (Levenberg 1944; Wampler
     1986 for arms), clipped to the box. An environment's damping grows tenfold after a step that
-    does not lower its residual, else it falls tenfold. `residual` maps (B, m) to (B, r) by row.
+    does not lower its residual, else it falls tenfold. The search ends early, but not on a GPU,
+    where no environment has a residual longer than `solved`. `residual` maps (B, m) to (B, r) by
+    row; slopes cost more than all else here.
     """
     best = torch.minimum(torch.maximum(start, low), high)
     factor = best.new_full((len(best), 1, 1), damping)
-    place, value = _traced(residual, best)
-    error, jacobian = value.detach(), _jacobian(place, value)
+    error = _value(residual, best)
     eye = torch.eye(best.shape[1], dtype=best.dtype, device=best.device)
     helped = True
-    for left in reversed(range(iterations)):
+    for _ in range(iterations):
         if helped:
+            if not best.is_cuda and bool((error.norm(dim=1) <= solved).all()):
+                break
+            jacobian = _jacobian(residual, best)
             normal = jacobian.mT @ jacobian
             size = normal.diagonal(dim1=1, dim2=2).mean(1)[:, None, None].clamp(min=1e-12)
             pull = (jacobian.mT @ error[..., None])[..., 0]
         move = torch.linalg.solve_ex(normal + factor * size * eye, pull)[0]
         tried = torch.minimum(torch.maximum(best - move, low), high)
-        place, value = _traced(residual, tried)
-        new_error = value.detach()
+        new_error = _value(residual, tried)
         better = new_error.square().sum(1) < error.square().sum(1)
         best = torch.where(better[:, None], tried, best)
-        if left == 0:
-            break
-        # A slope costs more than all else here. A GPU does not wait for the answer.
+        error = torch.where(better[:, None], new_error, error)
+        # A GPU does not wait for the answer.
         helped = best.is_cuda or bool(better.any())
-        if helped:
-            error = torch.where(better[:, None], new_error, error)
-            jacobian = torch.where(better[:, None, None], _jacobian(place, value), jacobian)
         factor = torch.where(better[:, None, None], 0.1 * factor, 10.0 * factor).clamp(1e-6, 1e6)
     return best
 
 
-def _traced(residual: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tensor, Tensor]:
-    """A copy of the points (B, m) and residuals (B, r) that depend on it; works under
-    inference_mode."""
+def _value(residual: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:
+    """Residuals (B, r) at points (B, m), without their slopes, which compiled arms do not have."""
+    with torch.no_grad():
+        return residual(at)
+
+
+def _jacobian(residual: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:
+    """Jacobians (B, r, m) of residuals (B, r) at points (B, m); works under inference_mode."""
     with torch.inference_mode(False), torch.enable_grad():
         place = at.clone().requires_grad_(True)
-        return place, residual(place)
-
-
-def _jacobian(place: Tensor, value: Tensor) -> Tensor:
-    """Jacobians (B, r, m) of residuals (B, r) at the points (B, m) that they depend on."""
-    with torch.inference_mode(False), torch.enable_grad():
+        value = residual(place)
         one = torch.eye(value.shape[1], dtype=value.dtype, device=value.device)
         each = one[:, None].expand(-1, len(value), -1)
         slopes = torch.autograd.grad(value, place, each, is_grads_batched=True)[0]
@@ -115,7 +120,7 @@ def _solved(arm, part, target, error, dt_s, offset) -> tuple[Tensor, Tensor]:
     def residual(pressure: Tensor) -> Tensor:
         return error(arm.predict(part, pressure, dt_s), target)
 
-    pressure = least_squares(residual, part.pressure + offset, low, high)
+    pressure = least_squares(residual, part.pressure + offset, low, high, solved=SOLVED_MM)
     return pressure, residual(pressure).norm(dim=1)
 
 
@@ -149,5 +154,5 @@ class Pointing:
                 points = self.arm.predict(part, pressure, self.dt_s)
                 return self.offset_mm(points, target, part.mount)
 
-            wanted = least_squares(residual, part.pressure, low, high)
+            wanted = least_squares(residual, part.pressure, low, high, solved=SOLVED_MM)
             return self.arm.action_for(part, wanted, self.dt_s)

@@ -17,6 +17,9 @@ from surgisoft.agents.run_folder import RunFolder
 from surgisoft.cli import run
 from tests.report.browser import chromium, look
 
+SHORT = ["follow.loop_s=2", "follow.approach_s=0.5"]
+"""Fields of `track_circle` with which an episode has 25 steps."""
+
 
 def test_the_plane_of_a_tilted_circle_shows_a_circle():
     turn = np.linspace(0.0, 2.0 * np.pi, 90)
@@ -37,7 +40,10 @@ def test_lines_break_where_the_target_jumps():
 
 
 def test_evaluate_writes_one_self_contained_page(tmp_path, capsys):
+    file = tmp_path / "short.toml"
+    file.write_text("\n".join(SHORT))
     arguments = ["evaluate", "scripted", "random", "--task", "track_circle", "--episodes", "2"]
+    arguments += ["--config", str(file)]
     assert run([*arguments, "--report", str(tmp_path / "r")]) == 0
     assert "report.html" in capsys.readouterr().out
     assert [path.name for path in (tmp_path / "r").iterdir()] == ["report.html"]
@@ -57,7 +63,7 @@ def runs(tmp_path_factory):
     for seed in (1, 2):
         options = f"--steps 768 --envs 32 --seed {seed} ppo.evaluation_episodes=2"
         options += f" ppo.evaluate_every=1 -o {folder / f'seed{seed}'}"
-        assert run(["train", "--task", "track_circle", *options.split()]) == 0
+        assert run(["train", "--task", "track_circle", *options.split(), *SHORT]) == 0
     return [folder / "seed1", folder / "seed2"]
 
 

@@ -107,7 +107,8 @@ def test_two_processes_learn_one_policy(tmp_path):
 
     torchrun(
         "--nproc-per-node", "2", "--master-addr", "127.0.0.1", "--master-port", str(port),
-        "-m", "surgisoft", "train", *SMALL, "-o", str(folder),
+        "-m", "surgisoft", "train", *SMALL, "follow.loop_s=2", "follow.approach_s=0.5",
+        "-o", str(folder),
     )  # fmt: skip
     run = RunFolder(folder)
     saved = run.load(LAST)

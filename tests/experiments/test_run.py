@@ -13,14 +13,14 @@ from types import SimpleNamespace
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from matplotlib import pyplot as plt
 
-from surgisoft.agents import session
+from surgisoft.agents import report_charts, session
 from surgisoft.agents.evaluate import Evaluation
 from surgisoft.agents.on_rig import RigConfig
 from surgisoft.cli import run
 from surgisoft.errors import InputError
 from surgisoft.experiments import run as experiment_run
-from surgisoft.experiments import session as experiment_session
 from surgisoft.experiments import spec as experiment_spec
 from surgisoft.experiments.page import rules
 from surgisoft.experiments.plan import build_task, settings
@@ -28,6 +28,7 @@ from surgisoft.experiments.results import drop_logs, sum_up
 from surgisoft.experiments.run import open_results, run_experiment
 from surgisoft.experiments.session import ExperimentRules, with_policy
 from surgisoft.experiments.spec import Case, load_experiment
+from surgisoft.report import Picture
 from surgisoft.scene.spec import PHANTOM
 from surgisoft.tasks.circle_ablation import CircleAblationConfig, success_rule
 from surgisoft.tasks.registry import spec_of
@@ -53,6 +54,17 @@ def whole(tmp_path_factory):
         patch.setattr(experiment_run, "roll_out_block", kept)
         assert run(["experiment", "run", str(file), "-o", str(results), "--no-replays"]) == 0
     return file, results
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Charts of pages are empty: `whole`, and tests of the charts, draw them."""
+
+    def empty(figure, alt, caption="", least_px=0):
+        plt.close(figure)
+        return Picture(b"<svg/>", alt, caption, "image/svg+xml", least_px)
+
+    monkeypatch.setattr(report_charts, "chart", empty)
 
 
 def _rows(folder):
@@ -97,9 +109,8 @@ values = [30.0, 40.0, 50.0]
 """
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_setting_whose_code_raises_leaves_the_others_their_report(tmp_path, monkeypatch, capsys):
-    """Charts of episodes, which are drawn one by one, are left to the other tests."""
-    monkeypatch.setattr(experiment_session, "episode_charts", lambda log: [])
     text = TINY.replace("repeats = 3", "repeats = 2").replace("together = 1", "together = 2")
     file, folder = write(tmp_path, text + THREE_TIMES), tmp_path / "r"
     play, broken = experiment_run.roll_out_block, ["simulation_cut_s=40"]
@@ -198,6 +209,7 @@ def test_an_interrupted_run_goes_on_where_it_stopped(whole, tmp_path):
     assert _rows(tmp_path / "r") == _rows(folder)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_cases_of_two_scenes_are_compared(tmp_path, capsys):
     """The rings of the two scenes have radii of 10 and 9 mm; a scene that changes is refused."""
     small = tmp_path / "small"
@@ -404,6 +416,7 @@ def test_evaluate_states_the_rule_of_success(monkeypatch):
     assert "within 0.7 mm of its target" in found.success_rule
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("name", ["track_circle", "keyhole"])
 def test_a_task_without_a_scene_makes_an_experiment(name, tmp_path, capsys):
     """From a file to its report: phases, the arm's controllers, a fault, numbers of the task."""
@@ -429,6 +442,7 @@ def test_a_task_without_a_scene_makes_an_experiment(name, tmp_path, capsys):
     assert f":1: scene: got '.'; expected none: {name} has no scene" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_fault_that_never_came_is_said_to_have_not(tmp_path, capsys):
     """And a task without a measure of success has no condition that waits for it."""
     file = tmp_path / "late.toml"

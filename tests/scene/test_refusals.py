@@ -41,6 +41,7 @@ def plane():
 
 
 def test_paths_that_cannot_be_cut_are_one_line(plane):
+    wide = box((250.0, 250.0, 10.0))
     point, two = spec(points_mm=[[0.0, 0.0, 5.0]] * 3), disc(5.0)[:2]
     for call, message in (
         (
@@ -48,7 +49,7 @@ def test_paths_that_cannot_be_cut_are_one_line(plane):
             "contour 'c' has no length: its points",
         ),
         (lambda: Plane.of(plane, disc(10.0)).on(plane, disc(90.0)[:, :2], "it"), "it extends over"),
-        (lambda: grown(plane, 30.0 * disc(30.0), 5.0), "mm wide, expected at most 200 mm"),
+        (lambda: grown(wide, disc(105.0), 5.0), "mm wide, expected at most 200 mm"),
         (lambda: raster(plane, disc(5.0), 1.0, 9.0, 0.5), "no line fits 9 mm inside the outline"),
         (lambda: path_patch(plane, [], 0.2), "0 paths, spacing 0.2 mm"),
         (lambda: cut_patch(plane, two, two, np.zeros(3), 0.2), "ring has shape (2, 3): expected"),

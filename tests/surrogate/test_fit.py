@@ -75,7 +75,7 @@ def test_nothing_is_added_where_there_is_no_hysteresis():
     """On an arm without memory neither direction nor plays earn a place."""
     rng = np.random.default_rng(2)
     train, valid = (history([walk(250, rng)] * 4, hysteresis=0.0, seed=s) for s in (1, 2))
-    config = replace(QUICK, epochs=30, effects=("hysteresis",))
+    config = replace(QUICK, epochs=15, learning_rate=1e-2, effects=("hysteresis",))
     result = fit(train, valid, SPEC, config)
     assert not result.model.effects
     assert not result.model.network.directions
@@ -238,7 +238,7 @@ def test_constant_curvature_recovers_a_constant_curvature_arm():
 
 def test_recurrent_baseline_learns(walks):
     train, valid, test = walks
-    config = FitConfig(network="recurrent", epochs=20, learning_rate=1e-2)
+    config = FitConfig(network="recurrent", epochs=12, learning_rate=1e-2)
     result = fit(train, valid, SPEC, config)
     assert rmse(result.model, test) < 0.1 * spread(test)
 
@@ -479,7 +479,7 @@ def test_auto_finds_the_lag_of_the_line():
     train, valid = (
         pack(*([run[k] for run in part] for k in range(3))) for part in (some[:6], some[6:])
     )
-    config = replace(SMALL, effects=("auto",), epochs=20, learning_rate=1e-2)
+    config = replace(SMALL, effects=("auto",), epochs=12, learning_rate=1e-2)
     result = fit(train, valid, SPEC, config)
     assert "line_lag" in result.model.effects
     stage = next(stage for stage in result.stages if stage.name == "line_lag")
@@ -488,7 +488,8 @@ def test_auto_finds_the_lag_of_the_line():
 
 
 def test_auto_adds_nothing_to_an_arm_without_memory():
-    result = fit(runs(range(10)), None, SPEC, replace(SMALL, effects=("auto",)))
+    config = replace(SMALL, effects=("auto",), epochs=15, learning_rate=1e-2)
+    result = fit(runs(range(10)), None, SPEC, config)
     assert not result.model.effects
     reasons = ("no effect with memory added", "no gain beyond chance")
     assert any(reason in warning for reason in reasons for warning in result.warnings)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import Field, dataclass, fields, is_dataclass, replace
+from dataclasses import Field, dataclass, fields, is_dataclass
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import torch
@@ -114,5 +114,5 @@ def _mapped(
             )
             for field in fields(tree)
         }
-        return replace(tree, **parts)
+        return type(tree)(**parts)
     return tree

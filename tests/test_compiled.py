@@ -60,3 +60,42 @@ def test_a_function_without_an_entry_from_python_says_so(tmp_path):
         first, *errors = done.stdout.splitlines()
         assert (first, done.returncode) == ("20 2.0", 0), done.stderr
         assert errors == ["double is called by compiled functions only (inner=True)"] * 2
+
+
+LEVELS = """import os
+import numba
+from numba.core import event
+from surgisoft.compiled import compiled
+
+class Levels(event.Listener):
+    def on_start(self, happened):
+        print(happened.data["dispatcher"].__name__, int(numba.config.OPT))
+    def on_end(self, happened):
+        pass
+
+event.register("numba:compile", Levels())
+numba.njit(lambda x: x)(1)
+@compiled(inner=True)
+def double(x):
+    return x + x
+@compiled
+def quadruple(x):
+    return double(double(x))
+quadruple(1)
+print(int(numba.config.OPT))
+os.environ["NUMBA_OPT"] = "1"
+numba.config.reload_config()
+@compiled
+def triple(x):
+    return x + x + x
+triple(1)
+"""
+
+
+def test_only_the_projects_own_functions_are_compiled_at_its_level(tmp_path, monkeypatch):
+    """A level of the environment stands for all."""
+    monkeypatch.delenv("NUMBA_OPT", raising=False)
+    script = tmp_path / "kernels.py"
+    script.write_text(LEVELS)
+    told = run(script).stdout.splitlines()
+    assert told == ["<lambda> 3", "quadruple 2", "double 2", "3", "triple 1"]

@@ -64,7 +64,7 @@ def bare_arm() -> ArmModel:
 
 
 def measured_on(
-    truth: ArmModel, runs: int = 4, rows: int = 400, seed: int = 0, noise_seed: int | None = None
+    truth: ArmModel, runs: int = 4, rows: int = 250, seed: int = 0, noise_seed: int | None = None
 ) -> Recording:
     """What cameras with white noise would record of a model that is the truth, at 10 Hz.
 

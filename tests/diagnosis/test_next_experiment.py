@@ -53,7 +53,7 @@ def arm():
 def lagging():
     """Two minutes of an arm with a hidden line lag."""
     rig = VirtualRig(0, take=3, hidden=[("line_lag", 1.0)])
-    return rig.record(make_protocol("mixed", rig.limits, 1800, seed=1))[0]
+    return rig.record(make_protocol("mixed", rig.limits, 900, seed=1))[0]
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,7 @@ def arm():
 def turned(arm):
     """A minute and a half of the model's own robot, bare, with its base rolled by 90 degrees."""
     rig = VirtualRig(0, take=7, roll_deg=90.0)
-    return rig.record(make_protocol("mixed", rig.limits, 1800, seed=2))[0]
+    return rig.record(make_protocol("mixed", rig.limits, 900, seed=2))[0]
 
 
 def test_the_same_direction_changes_nothing(arm, turned):

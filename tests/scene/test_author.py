@@ -684,6 +684,42 @@ def test_a_second_file_has_a_unit_and_an_up_of_its_own(tmp_path):
     np.testing.assert_allclose(vessel.bounds_mm, [[-50, -30, 180], [50, 30, 220]], atol=1e-3)
 
 
+@pytest.mark.parametrize(("unit", "scale", "told"), [("m", 1.0, "error"), ("mm", 1000.0, "note")])
+def test_a_further_body_in_another_unit_is_told(tmp_path, unit, scale, told):
+    """A vessel of 60 mm, 25 mm beside an organ of 100 mm at 900 mm from the origin: in mm beside an
+    organ in metres it is 60 m long and an error; in metres beside an organ in mm it is a speck at
+    the origin, 0.9 m less 50 mm away."""
+    organ = trimesh.creation.box((0.1, 0.1, 0.1))
+    vessel = trimesh.creation.box((0.01, 0.06, 0.01))
+    vessel.apply_translation((0.08, 0.0, 0.0))
+    for shape, factor in ((organ, scale), (vessel, 1000.0 / scale)):
+        shape.apply_translation((0.0, 0.0, 0.9))
+        shape.apply_scale(factor)
+    organ.export(tmp_path / "organ.stl")
+    vessel.export(tmp_path / "vessel.stl")
+    files = tmp_path / "organ.stl", tmp_path / "vessel.stl"
+    request = Request(files, ("organ", "keep-out"), unit=unit)
+    if told == "error":
+        with pytest.raises(
+            InputError, match=r"60000 mm across .* in mm .* 60 mm across and about 25 mm"
+        ):
+            prepare(request)
+    else:
+        said = next(note for note in prepare(request).notes if "vessel.stl: unit" in note)
+        assert "0.06 mm across and about 849 mm away from the organ, which is 100 mm across" in said
+        assert "in m it would be 60 mm across and about 25 mm away" in said
+
+
+def test_a_body_beside_the_organ_in_its_unit_is_not_doubted(tmp_path):
+    for name, size, x in (("organ", 100.0, 0.0), ("table", 700.0, 410.0)):
+        shape = trimesh.creation.box((size,) * 3)
+        shape.apply_translation((x, 0.0, 0.0))
+        shape.export(tmp_path / f"{name}.stl")
+    files = tmp_path / "organ.stl", tmp_path / "table.stl"
+    notes = prepare(Request(files, ("organ", "support"))).notes
+    assert f"table.stl: unit that of {files[0].name}" in notes
+
+
 def test_the_organ_is_the_largest_body_of_its_file(tmp_path):
     """A node of 20 mm comes before the organ of 80 mm."""
     scene = trimesh.Scene()

@@ -17,6 +17,7 @@ from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.contours import SurfacePath, contour_path, outline_crossing_mm
 from surgisoft.scene.dose_patch import check_apart
 from surgisoft.scene.folder import Scene
+from surgisoft.scene.inside import buried_faces
 from surgisoft.scene.lesion import (
     ON_SURFACE_MM,
     RING_POINTS,
@@ -296,10 +297,13 @@ def _mesh_findings(scene: Scene) -> tuple[Finding, ...]:
         mesh = body.mesh
         closed = mesh.is_watertight and mesh.volume_mm3 > 0.0
         kind = "closed" if closed else "inside out" if mesh.is_watertight else "open"
+        volume = f"{mesh.volume_mm3 / 1000.0:.4g} ml"
+        if closed and buried_faces(mesh):
+            volume = "overlaps itself, volume unknown"  # its integral counts overlaps twice
         rows.append(
             Finding(
                 f"{body.role} '{body.name}'",
-                f"{len(mesh.faces)} faces, {kind}, {mesh.volume_mm3 / 1000.0:.4g} ml",
+                f"{len(mesh.faces)} faces, {kind}, {volume}",
                 "closed, wound outwards",
                 closed,
             )

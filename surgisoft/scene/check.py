@@ -30,6 +30,8 @@ from surgisoft.scene.lesion import (
     path_slack_mm,
 )
 from surgisoft.scene.mounted_arm import (
+    FEED_MM,
+    FEED_STEP_MM,
     LANDED_MM,
     TOUCHED_MM,
     EndoscopePose,
@@ -42,7 +44,7 @@ from surgisoft.scene.mounted_arm import (
     touch_lesion,
 )
 from surgisoft.scene.reach import ArmReach
-from surgisoft.scene.spec import CameraSpec
+from surgisoft.scene.spec import WALL, CameraSpec
 
 REASONS = ("can be cut", "out of reach", "too steep", "beam blocked", "no clearance", "arm jumps")
 """Meaning of a ring point's code; a point gets the first that applies after the first entry."""
@@ -169,6 +171,7 @@ def check_scene(
     report(moments + 1, moments + 2, "paths from rest")
     ways = _way_finding(scene, checker, arms, work)
     findings = (*findings, *_work_findings(scene, work), ways)
+    findings = (*findings, *_insertion_findings(scene, checker, arms))
     for path in paths:
         findings = (*findings, *_contour_findings(scene, path, checker, arms))
     return SceneCheck(findings, work)
@@ -406,14 +409,39 @@ def _work_findings(scene: Scene, work: Work) -> tuple[Finding, ...]:
 def _way_finding(
     scene: Scene, checker: CollisionChecker, arms: dict[str, MountedArm], work: Work
 ) -> Finding:
-    touching, least, half_step = _ways(checker, arms, work)
-    clearance = scene.spec.limits.clearance_mm
+    return _contacts(scene, "contacts at rest and on the path", *_ways(checker, arms, work))
+
+
+def _contacts(
+    scene: Scene, what: str, touching: list[str], least_mm: float, half_step_mm: float
+) -> Finding:
+    """The line on contacts of arms, and on the clearance that the steps between shapes ask for."""
+    wanted = max(scene.spec.limits.clearance_mm, half_step_mm)
+    near = f"none (closest {least_mm:.1f} mm)"
+    if least_mm < wanted:
+        near = f"too near, {least_mm:.2f} mm"
     return Finding(
-        "contacts at rest and on the path",
-        ", ".join(touching) or f"none (closest {least:.1f} mm)",
-        f"none, {clearance:g} mm clearance",
-        not touching and least >= max(clearance, half_step),
+        what,
+        ", ".join(touching) or near,
+        f"none, {wanted:.3g} mm clearance",
+        not touching and least_mm >= wanted,
     )
+
+
+def _insertion_findings(
+    scene: Scene, checker: CollisionChecker, arms: dict[str, MountedArm]
+) -> list[Finding]:
+    """Contacts while all arms are fed in through the ports of a scene's wall, all by the same way.
+
+    `keyhole_ablation` does so. Without a body named `WALL` nothing is checked.
+    """
+    if WALL not in [body.name for body in scene.bodies]:
+        return []
+    ways = {name: arm.way_in() for name, arm in arms.items()}
+    moments = [dict(zip(ways, lines, strict=True)) for lines in zip(*ways.values(), strict=True)]
+    found = _closest(checker, arms, moments)
+    what = f"insertion through the ports ({FEED_MM:g} mm)"
+    return [_contacts(scene, what, *found, 0.5 * FEED_STEP_MM)]
 
 
 def _view(
@@ -438,7 +466,9 @@ def _view(
     return np.array(fractions)
 
 
-def _ways(checker: CollisionChecker, arms: dict[str, MountedArm], work: Work):
+def _ways(
+    checker: CollisionChecker, arms: dict[str, MountedArm], work: Work
+) -> tuple[list[str], float, float]:
     """Contacts at rest and on the paths to the lesion, endoscopes first; smallest clearance.
 
     Each plain tip goes back to rest before the next arm moves. The third result is half the largest
@@ -460,6 +490,17 @@ def _ways(checker: CollisionChecker, arms: dict[str, MountedArm], work: Work):
         moments += [stand | {name: line} for line in way]
         if name not in work.touches:
             stand[name] = way[-1]
+    steps = [np.linalg.norm(np.diff(way, axis=0), axis=-1).max() for way in ways.values()]
+    return *_closest(checker, arms, moments), 0.5 * float(max(steps))
+
+
+def _closest(
+    checker: CollisionChecker, arms: dict[str, MountedArm], moments: list[dict[str, np.ndarray]]
+) -> tuple[list[str], float]:
+    """Contacts in words, each once, and the smallest clearance (mm) of arms at some moments.
+
+    moments: centrelines (K, 3) mm of each arm by name, world frame.
+    """
     touching: dict[str, None] = {}
     least = np.inf
     for lines in moments:
@@ -467,8 +508,7 @@ def _ways(checker: CollisionChecker, arms: dict[str, MountedArm], work: Work):
         for collision in checker.collisions(shapes):
             touching[f"{collision.arm} touches {collision.other}"] = None
         least = min(least, checker.clearance(shapes).least_mm)
-    steps = [np.linalg.norm(np.diff(way, axis=0), axis=-1).max() for way in ways.values()]
-    return list(touching), float(least), 0.5 * float(max(steps))
+    return list(touching), float(least)
 
 
 @dataclass(frozen=True, eq=False)

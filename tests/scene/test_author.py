@@ -47,7 +47,7 @@ from surgisoft.surrogate.networks import ConstantCurvature
 from surgisoft.tasks.world.arm import Pneumatics, Randomisation
 from surgisoft.tasks.world.authoring import make_scene
 from surgisoft.tasks.world.random_streams import streams
-from surgisoft.tasks.world.reach import blank_mounts, reaches_of
+from surgisoft.tasks.world.reach import blank_mounts, reach_of, reaches_of
 from surgisoft.tasks.world.world import WorldConfig, scene_world, single_arm_world
 from tests.scene.shapes import ball, box, lumpy
 
@@ -787,6 +787,35 @@ def test_a_callable_arm_becomes_a_scenes_arm_as_a_folder(tmp_path, monkeypatch, 
     assert (mount.length_mm, mount.diameter_mm) == (42.0, 9.0)
     assert mount.arm == str(tmp_path / "my_arm")
     assert not (tmp_path / "scene").exists()
+
+
+@pytest.mark.parametrize(
+    ("length_mm", "body", "told"),
+    [
+        (60.0, 0.06, "in m: along the body, base to tip, they are 0.06 long, where the arm is 60"),
+        (60.0, 6.0, "in cm: along the body, base to tip, they are 6 long, where the arm is 60 mm"),
+        (0.06, 0.06, "in m: along the body, base to tip, they are 0.06 long, where an arm is 3 mm"),
+    ],
+)
+def test_an_arm_in_another_unit_of_length_gets_no_mount(tmp_path, length_mm, body, told):
+    """As `compare` says it; also of an arm whose stated length is in that unit."""
+    file = tmp_path / "straight.py"
+    file.write_text(
+        "import numpy as np\n"
+        "class Arm:\n"
+        "    static, error_mm = True, 1.0\n"
+        "    low, high = (0.0, 0.0), (50.0, 50.0)\n"
+        f"    length_mm = {length_mm}\n"
+        "    def __call__(self, time_s, actuation):\n"
+        f"        line = np.linspace(0.0, {body}, 4)[None, :, None] * np.array([0.0, 0.0, 1.0])\n"
+        "        return np.tile(line, (len(actuation), 1, 1))\n"
+        "arm = Arm()\n"
+    )
+    save_model(load_model(f"{file}:arm"), tmp_path / "arm")
+    mount = blank_mounts(models={"laser": str(tmp_path / "arm")})["laser"]
+    with pytest.raises(InputError, match=re.escape(f"arm: returns key points {told}")) as error:
+        reach_of(mount)
+    assert f"expected mm: multiply them by {10 if body == 6.0 else 1000}" in str(error.value)
 
 
 def test_an_existing_folder_is_kept(made, tmp_path, capsys):

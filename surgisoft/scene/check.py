@@ -17,7 +17,7 @@ from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.contours import SurfacePath, contour_path, outline_crossing_mm
 from surgisoft.scene.dose_patch import check_apart
 from surgisoft.scene.folder import Scene
-from surgisoft.scene.inside import buried_faces
+from surgisoft.scene.inside import buried_faces, points_inside
 from surgisoft.scene.lesion import (
     ON_SURFACE_MM,
     RING_POINTS,
@@ -29,6 +29,7 @@ from surgisoft.scene.lesion import (
     path_off_mm,
     path_slack_mm,
 )
+from surgisoft.scene.mesh import Body
 from surgisoft.scene.mounted_arm import (
     FEED_MM,
     FEED_STEP_MM,
@@ -48,6 +49,8 @@ from surgisoft.scene.spec import WALL, CameraSpec
 
 REASONS = ("can be cut", "out of reach", "too steep", "beam blocked", "no clearance", "arm jumps")
 """Meaning of a ring point's code; a point gets the first that applies after the first entry."""
+OUT_OF_REACH = 1
+"""Code of a ring point that is out of reach."""
 CONTOUR_STEP_MM = 0.5
 """Spacing of a contour's points, of which RING_POINTS are checked (mm)."""
 PATCH_SHARES = np.linspace(0.1, 1.6, 16)
@@ -221,7 +224,7 @@ def _contour_findings(
     points, normals = path.points_mm[chosen], path.normals[chosen]
     ring = Ring(middle[0], path.normal, points, normals, np.repeat(face, count))
     work = _work(scene, ring, path.closed, checker, arms, silent)
-    return [*nearby, *_reach_findings(work, what)]
+    return [*nearby, *_reach_findings(scene, work, what)]
 
 
 def _work(
@@ -320,7 +323,10 @@ def _lesion_finding(scene: Scene) -> Finding:
     nearest, _ = nearest_on_surface(scene.organ.world_mesh, centre[None])
     off = float(np.linalg.norm(nearest[0] - centre))
     value, lies = f"{off:.3f} mm off", off <= ON_SURFACE_MM
-    if lies:
+    if not lies:
+        there = ", ".join(f"{x:.2f}" for x in nearest[0])
+        value = f"{off:.3f} mm off, nearest is [{there}]"
+    else:
         try:
             scene.ring_of()
         except InputError:
@@ -356,23 +362,40 @@ def _neighbour_findings(scene: Scene, what: str, points_mm: np.ndarray) -> tuple
     return tuple(rows)
 
 
-def _reach_findings(work: Work, what: str) -> list[Finding]:
-    """Which share of a path each laser can cut, and what keeps it from the rest."""
+def _reach_findings(scene: Scene, work: Work, what: str) -> list[Finding]:
+    """Which share of a path each laser can cut, and what keeps it from the rest.
+
+    Where it reaches none of it: by how much it misses the nearest point, or the body in which its
+    base is.
+    """
     rows = []
     for name, reason in work.reasons.items():
         lacking = [
             f"{100 * np.mean(reason == code):.0f} % {REASONS[code]}"
             for code in np.unique(reason[reason > 0])
         ]
+        if (reason == OUT_OF_REACH).all():
+            base = np.asarray(scene.spec.mount(name).position_mm)
+            inside = [body.name for body in scene.bodies if _holds(body, base)]
+            lacking[-1] += (
+                f": its base is inside '{inside[0]}'"
+                if inside
+                else f", the nearest point by {work.cuts[name].missed_mm.min():.3g} mm"
+            )
         whose = "the laser's reach" if len(work.reasons) == 1 else f"reach of {name}"
         covered = ", ".join((f"{100 * np.mean(reason == 0):.0f} %", *lacking))
         rows.append(Finding(f"{what} in {whose}", covered, "100 %", not lacking))
     return rows
 
 
+def _holds(body: Body, point_mm: np.ndarray) -> bool:
+    """Whether a body encloses a point (3,) mm of the world."""
+    return bool(points_inside(body.mesh, frames.apply(frames.invert(body.pose), point_mm[None]))[0])
+
+
 def _work_findings(scene: Scene, work: Work) -> tuple[Finding, ...]:
     limits, (low, high) = scene.spec.limits, scene.spec.camera.range_mm
-    least, rows = float(work.clearance_mm.min()), _reach_findings(work, "ring")
+    least, rows = float(work.clearance_mm.min()), _reach_findings(scene, work, "ring")
     rows.append(
         Finding(
             "clearance at work",

@@ -97,6 +97,9 @@ class RingSolution:
     """(M, 3) of the beam."""
     in_reach: np.ndarray
     """(M,) bool: the axis meets the point at an allowed distance."""
+    missed_mm: np.ndarray
+    """(M,) by how much the axis runs past the point, and the point is beyond the allowed distances
+    (mm), as the root of the sum of squares."""
     standoff_mm: np.ndarray
     """(M,) from the tip to the point (mm)."""
     incidence_rad: np.ndarray
@@ -116,12 +119,16 @@ def solve_ring(arm: MountedArm, ring: Ring, laser: LaserSpec) -> RingSolution:
     lines, directions = arm.lines(aimed.commands)
     low, high = laser.standoff_mm
     incidence = frames.angle_between(-directions, ring.normals)
+    away = ring.points_mm - lines[:, -1]
+    aside = frames.norm(away - frames.dot(away, directions)[:, None] * directions)
+    beyond = aimed.ahead_mm - aimed.ahead_mm.clip(low, high)
     return RingSolution(
         centre=centre,
         commands=aimed.commands,
         lines_mm=lines,
         directions=directions,
         in_reach=aimed.on_target & (aimed.ahead_mm >= low) & (aimed.ahead_mm <= high),
+        missed_mm=np.hypot(aside, beyond),
         standoff_mm=aimed.ahead_mm,
         incidence_rad=incidence,
         steep=incidence > np.radians(laser.max_incidence_deg),

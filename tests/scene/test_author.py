@@ -236,6 +236,48 @@ def test_a_mount_moved_into_the_organ_is_found(made, tmp_path):
     assert run(["scene", "check", str(folder)]) == 1
 
 
+def reach_of_laser_at(made, folder, position_mm):
+    """The line on the laser's reach with its base at another place."""
+    scene = open_scene(made[1])
+    laser = dataclasses.replace(scene.spec.mount("laser"), position_mm=tuple(position_mm))
+    scene = open_scene(scene_with(made, folder, mounts=(laser, scene.spec.mount("endoscope"))))
+    return finding(check_scene(scene, reaches_of(scene)), "ring in the laser's reach").value
+
+
+def test_a_laser_out_of_reach_is_told_by_how_much(made, tmp_path):
+    """1 m behind its mount: the arm is 70 to 85 mm long and the beam at most 60 mm."""
+    scene = open_scene(made[1])
+    mount = scene.spec.mount("laser")
+    direction = np.array(mount.direction) / np.linalg.norm(mount.direction)
+    base = np.array(mount.position_mm) - 1000.0 * direction
+    value = reach_of_laser_at(made, tmp_path, base)
+    told = float(re.search(r"100 % out of reach, the nearest point by (\S+) mm", value)[1])
+    away = np.linalg.norm(scene.ring.points_mm - base, axis=1).min()
+    assert away - 85.0 - 60.0 < told < away - 70.0 - 60.0
+
+
+def test_a_base_inside_a_body_is_named(made, tmp_path):
+    """In the organ's middle, with the lesion behind it."""
+    value = reach_of_laser_at(made, tmp_path, (0.0, 0.0, 0.0))
+    assert value.endswith("100 % out of reach: its base is inside 'organ'")
+
+
+@pytest.mark.parametrize("off_mm", [2.0, 30.0])
+def test_a_lesion_off_the_surface_is_told_the_point_that_lies_on_it(made, tmp_path, off_mm):
+    """Above the lesion of before, along its normal: that is the nearest point, or a nearer one."""
+    scene = open_scene(made[1])
+    centre = np.array(scene.spec.lesion.centre_mm) + off_mm * scene.ring.normal
+    folder = scene_with(made, tmp_path, lesion=LesionSpec("organ", tuple(centre.tolist())))
+    value = finding(check_scene(open_scene(folder), {}), "lesion on the surface").value
+    off, typed = re.fullmatch(r"(\S+) mm off, nearest is \[(.*)\]", value).groups()
+    point = tuple(float(x) for x in typed.split(", "))
+    assert np.linalg.norm(centre - point) == pytest.approx(float(off), abs=0.02)
+    assert float(off) <= off_mm
+    again = scene_with(made, tmp_path, lesion=LesionSpec("organ", point, 5.0))
+    scene = open_scene(again)
+    assert finding(check_scene(scene, reaches_of(scene)), "lesion on the surface").good
+
+
 def test_a_lesion_out_of_reach_is_told_why(made, tmp_path):
     scene = open_scene(made[1])
     low = scene.organ.world_mesh.vertices_mm[np.argmin(scene.organ.world_mesh.vertices_mm[:, 2])]

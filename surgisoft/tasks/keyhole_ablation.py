@@ -173,7 +173,9 @@ class KeyholeAblation(RingTask[PortCut]):
         if c.wall not in names:
             raise InputError(
                 f"scene '{self.spec.name}' has the bodies {', '.join(names)}, expected the wall "
-                f"'{c.wall}' among them"
+                f"'{c.wall}' among them: add [[bodies]] with this name, a mesh with a port around "
+                'the axis of each arm and role = "keep-out", or give the name of another body as '
+                "`wall` in --config (docs/scenes.md, Walls and ports)"
             )
         self._wall = names.index(c.wall)
 

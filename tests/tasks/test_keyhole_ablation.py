@@ -1,6 +1,9 @@
 """Two arms through the ports of a wall: the feed, the scripted expert, the rims and success."""
 
+import re
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -188,8 +191,25 @@ def test_a_bent_arm_meets_the_rim_on_its_way_in(quick):
     assert max(off.values()) > 4.0, "the port leaves 4.5 mm on each side"
 
 
+def test_the_manuals_wall_makes_a_scene_of_the_task(tmp_path):
+    """Its block, appended to the phantom's scene, whose folder has the mesh."""
+    manual = (Path(__file__).resolve().parents[2] / "docs" / "scenes.md").read_text()
+    section = manual.partition("## Walls and ports")[2].partition("## From Python")[0]
+    (block,) = re.findall(r"```toml\n(.*?)```", section, re.S)
+    shutil.copytree(PHANTOM, tmp_path / "scene")
+    file = tmp_path / "scene" / "scene.toml"
+    file.write_text(file.read_text().partition("[[contours]]")[0] + block)
+    assert insertion(open_scene(file.parent)).good
+    task = KeyholeAblation(KeyholeAblationConfig(scene=file.parent))
+    state = Episodes(task).seeded(0, 1)
+    assert task.out_mm(state).tolist() == [80.0]
+    assert min(float(rim) for rim in task.rims_mm(state).values()) > 5.0
+
+
 def test_wrong_scenes_and_numbers_are_one_line():
-    with pytest.raises(InputError, match="liver, gallbladder, tray, expected the wall 'wall'"):
+    with pytest.raises(
+        InputError, match=r"liver, gallbladder, tray, expected the wall 'wall'.*add \[\[bodies"
+    ):
         KeyholeAblation(KeyholeAblationConfig(scene=PHANTOM))
     with pytest.raises(InputError, match="rim_mm is 0"):
         KeyholeAblationConfig(rim_mm=0.0)

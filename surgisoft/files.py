@@ -74,6 +74,15 @@ def new_file(path: str | Path, noted: bool = True) -> Iterator[Path]:
         fresh.unlink(missing_ok=True)
 
 
+def check_folder(path: Path | None) -> None:
+    """Raise InputError unless a folder exists or can be made."""
+    if path is None:
+        return
+    above = next(parent for parent in (path.absolute() / "x").parents if parent.exists())
+    if not above.is_dir() or not os.access(above, os.W_OK):
+        raise InputError(f"{path}: cannot be written, {above} is not a writable folder")
+
+
 def check_export_folder(folder: str | Path, mark: str, force: bool) -> None:
     """Raise InputError unless a folder is free for an export, or holds one and `force` is given.
 
@@ -101,9 +110,9 @@ def new_folder(folder: str | Path, own: Sequence[str] = ()) -> Iterator[Path]:
     given, folder = Path(folder), resolved(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     fresh = _beside(folder)
-    fresh.mkdir()
     try:
         with _named(given, fresh):
+            fresh.mkdir()
             yield fresh
             if not folder.exists():
                 os.replace(fresh, folder)

@@ -143,6 +143,18 @@ def test_a_failed_write_names_what_the_user_named(tmp_path):
         raise OSError("words alone")
 
 
+def test_a_folder_that_cannot_be_made_is_named_as_given(tmp_path, monkeypatch):
+    """Its temporary name is not: a file system such as /proc makes no folders."""
+
+    def none_made(place, *given):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(place))
+
+    monkeypatch.setattr(os, "mkdir", lambda place, *given: os.path.isdir(place) or none_made(place))
+    with pytest.raises(OSError, match="Read-only") as caught, new_folder(tmp_path / "b"):
+        pass
+    assert caught.value.filename == str(tmp_path / "b")
+
+
 def test_json_has_null_for_numbers_that_are_not_finite(tmp_path):
     value = {"a": [1.5, math.nan], "b": (math.inf, "x"), "c": np.array([1.0, -np.inf])}
     write_json(tmp_path / "a.json", value | {"d": np.float64("nan"), "e": np.int64(3), "f": None})

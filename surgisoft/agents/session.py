@@ -388,11 +388,11 @@ def beam_beyond_limits_of(config: Any) -> str:
 
 
 def _warn_of_reach(task: Task, on_warning: Callable[[str], None]) -> None:
-    """Warn of a path that leaves the arm's reach: no policy can follow it there."""
+    """Warn of a path that leaves the arm's reach, as far as a search shows."""
     if beyond := beyond_reach(task):
         on_warning(
-            f"{beyond}: no policy comes nearer; make the path smaller (size_mm) or move its centre "
-            "(docs/evaluate.md)"
+            f"{beyond}: a search of the arm's steady states found none that comes nearer; make the "
+            "path smaller (size_mm) or move its centre (docs/evaluate.md)"
         )
 
 

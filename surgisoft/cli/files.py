@@ -1,6 +1,5 @@
 """Output paths: checks before a command spends its time, and lines about what was written."""
 
-import os
 from collections import Counter
 from collections.abc import Iterable
 from importlib.util import find_spec
@@ -8,7 +7,7 @@ from pathlib import Path
 
 from surgisoft.command_line import typed
 from surgisoft.errors import InputError
-from surgisoft.files import read_json
+from surgisoft.files import check_folder, read_json
 
 
 def check_free(path: Path | None, *keys: str) -> None:
@@ -28,15 +27,6 @@ def check_free(path: Path | None, *keys: str) -> None:
         same = False
     if not same:
         raise InputError(f"{path}: exists already and is not an older result; choose another file")
-
-
-def check_folder(path: Path | None) -> None:
-    """Raise InputError unless a folder exists or can be made."""
-    if path is None:
-        return
-    above = next(parent for parent in (path.absolute() / "x").parents if parent.exists())
-    if not above.is_dir() or not os.access(above, os.W_OK):
-        raise InputError(f"{path}: cannot be written, {above} is not a writable folder")
 
 
 def check_new_folder(path: Path | None) -> None:

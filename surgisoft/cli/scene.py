@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder, show_written
+from surgisoft.cli.files import show_written
 from surgisoft.cli.inputs import warn
 from surgisoft.cli.options import (
     EffectFiles,
@@ -188,7 +188,6 @@ def check(
         from surgisoft.replay.reach_map import check_map
 
         check_map(scene, picture)
-        check_folder(picture.absolute().parent)
     reaches = reaches_of(scene)
     with progress("scene check") as report:
         verdict = check_scene(scene, reaches, report)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from surgisoft.errors import InputError
-from surgisoft.files import write_atomically
+from surgisoft.files import check_folder, write_atomically
 from surgisoft.scene.check import REASONS, Patch, SceneCheck, sentence
 from surgisoft.scene.folder import Scene
 from surgisoft.scene.mounted_arm import RingSolution, ring_moments
@@ -27,6 +27,7 @@ def check_map(scene: Scene, path: Path) -> None:
         raise InputError(f"{path}: is a folder, expected a file to write")
     if not scene.spec.arms_with("laser"):
         raise InputError("no arm of the scene carries a laser, so there is no map to draw")
+    check_folder(path.absolute().parent)
 
 
 def draw_reach_map(

@@ -23,7 +23,7 @@ from typing import Any
 import rerun as rr
 
 from surgisoft.errors import InputError, unknown_name
-from surgisoft.files import write_atomically
+from surgisoft.files import check_folder, write_atomically
 from surgisoft.replay.contents import contents
 
 LOCAL = "127.0.0.1"
@@ -232,8 +232,7 @@ def check_picture(picture: Path) -> None:
         raise InputError(f"{picture}: suffix '{picture.suffix}', expected .png")
     if picture.is_dir():
         raise InputError(f"{picture}: is a folder, expected a file to write")
-    if not picture.parent.is_dir():
-        raise InputError(f"{picture.parent}: there is no such folder for the picture")
+    check_folder(picture.absolute().parent)
 
 
 def take_screenshot(

@@ -29,8 +29,10 @@ from surgisoft.scene.lesion import (
 )
 from surgisoft.scene.mesh import ROLES, Body, Mesh, used_indices
 from surgisoft.scene.meshio import (
+    ABSURD,
     GLTF,
     MM_PER_UNIT,
+    PLAUSIBLE_MM,
     LengthUnit,
     Part,
     given_unit,
@@ -244,6 +246,7 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
     operable: list[int] = []
     lesion: SegmentedLesion | None = None
     unit: LengthUnit | None = None
+    organ_mm = np.zeros((2, 3))
     for i, (path, role) in enumerate(zip(request.meshes, request.roles, strict=True)):
         on_step = partial(_report_step, report, i, len(request.meshes), path.name)
         on_step("reading")
@@ -259,11 +262,14 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
             part_roles = tuple(role for _ in parts)
             unit = _unit(request, path, _size(path, parts), unit if i else None)
             scale = unit.mm
-            notes.append(f"{path.name}: unit {unit.sentence}")
+            doubt = _doubt(path, _box(parts, UP[up]), organ_mm, unit) if i else ""
+            notes.append(f"{path.name}: unit {unit.sentence}{doubt}")
         if up != "z":
             what = "anterior (y)" if is_segmentation(path) and up == "y" else up
             notes.append(f"{path.name}: {what} points up; another axis needs --up")
         frames_to_world.append(scale * UP[up])
+        if i == 0:
+            organ_mm = _box(parts, frames_to_world[0])
         for group, group_role in _by_role(parts, part_roles):
             found = _closed_bodies(path, group, frames_to_world[-1], notes, on_step)
             found = sorted(found, key=lambda body: -_area(body[1]))
@@ -332,6 +338,49 @@ def _unit(request: Request, path: Path, size: float, first: LengthUnit | None) -
     if request.unit is not None or request.scale is not None:
         return given_unit(path, size, request.unit, request.scale)
     return stored_unit(path, size)
+
+
+def _box(parts: Sequence[Part], to_world: np.ndarray) -> np.ndarray:
+    """(2, 3): least and largest coordinates of a file's meshes, turned and scaled by (3, 3)."""
+    corners = [part.vertices[used_indices(part.faces)[0]] for part in parts]
+    turned = np.concatenate(corners) @ to_world.T
+    return np.stack((turned.min(axis=0), turned.max(axis=0)))
+
+
+def _doubt(path: Path, box: np.ndarray, organ_mm: np.ndarray, unit: LengthUnit) -> str:
+    """Words about a further body whose unit seems wrong, with the units that fit; else empty.
+
+    It seems wrong where the body is farther from the organ than the organ is large, or below the
+    size at which an organ's is an error. Above it raises InputError.
+
+    box: (2, 3) the body's least and largest coordinates, in the file's unit; organ_mm: (2, 3) mm.
+    """
+    organ, (low, high) = float(np.ptp(organ_mm, axis=0).max()), PLAUSIBLE_MM
+
+    def placed(mm: float) -> tuple[float, float]:
+        apart = np.maximum(mm * box[0] - organ_mm[1], organ_mm[0] - mm * box[1])
+        return mm * float(np.ptp(box, axis=0).max()), float(np.linalg.norm(apart.clip(min=0.0)))
+
+    def fits(mm: float) -> bool:
+        size, away = placed(mm)
+        return away <= organ and low / ABSURD <= size <= high * ABSURD
+
+    def told(mm: float) -> str:
+        size, away = (f"{x:.2g}" if x < 10.0 else f"{x:.0f}" for x in placed(mm))
+        return f"{size} mm across and about {away} mm away"
+
+    if fits(unit.mm):
+        return ""
+    others = [f"; in {u} it would be {told(mm)}" for u, mm in MM_PER_UNIT.items() if fits(mm)]
+    doubt = (
+        f", but the body would be {told(unit.mm)} from the organ, which is {organ:.3g} mm across"
+        f"{''.join(others)}"
+    )
+    if placed(unit.mm)[0] > high * ABSURD:
+        raise InputError(
+            f"{path}: unit {unit.sentence}{doubt}; expected the unit of the organ: scale this file"
+        )
+    return f"{doubt}: scale this file if its unit is another"
 
 
 def _by_role(parts: Sequence[Part], roles: Sequence[str]) -> list[tuple[list[Part], str]]:

@@ -17,6 +17,7 @@ from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.contours import SurfacePath, contour_path, outline_crossing_mm
 from surgisoft.scene.dose_patch import check_apart
 from surgisoft.scene.folder import Scene
+from surgisoft.scene.inside import buried_faces, points_inside
 from surgisoft.scene.lesion import (
     ON_SURFACE_MM,
     RING_POINTS,
@@ -28,7 +29,10 @@ from surgisoft.scene.lesion import (
     path_off_mm,
     path_slack_mm,
 )
+from surgisoft.scene.mesh import Body
 from surgisoft.scene.mounted_arm import (
+    FEED_MM,
+    FEED_STEP_MM,
     LANDED_MM,
     TOUCHED_MM,
     EndoscopePose,
@@ -41,10 +45,12 @@ from surgisoft.scene.mounted_arm import (
     touch_lesion,
 )
 from surgisoft.scene.reach import ArmReach
-from surgisoft.scene.spec import CameraSpec
+from surgisoft.scene.spec import WALL, CameraSpec
 
 REASONS = ("can be cut", "out of reach", "too steep", "beam blocked", "no clearance", "arm jumps")
 """Meaning of a ring point's code; a point gets the first that applies after the first entry."""
+OUT_OF_REACH = 1
+"""Code of a ring point that is out of reach."""
 CONTOUR_STEP_MM = 0.5
 """Spacing of a contour's points, of which RING_POINTS are checked (mm)."""
 PATCH_SHARES = np.linspace(0.1, 1.6, 16)
@@ -168,6 +174,7 @@ def check_scene(
     report(moments + 1, moments + 2, "paths from rest")
     ways = _way_finding(scene, checker, arms, work)
     findings = (*findings, *_work_findings(scene, work), ways)
+    findings = (*findings, *_insertion_findings(scene, checker, arms))
     for path in paths:
         findings = (*findings, *_contour_findings(scene, path, checker, arms))
     return SceneCheck(findings, work)
@@ -217,7 +224,7 @@ def _contour_findings(
     points, normals = path.points_mm[chosen], path.normals[chosen]
     ring = Ring(middle[0], path.normal, points, normals, np.repeat(face, count))
     work = _work(scene, ring, path.closed, checker, arms, silent)
-    return [*nearby, *_reach_findings(work, what)]
+    return [*nearby, *_reach_findings(scene, work, what)]
 
 
 def _work(
@@ -296,10 +303,13 @@ def _mesh_findings(scene: Scene) -> tuple[Finding, ...]:
         mesh = body.mesh
         closed = mesh.is_watertight and mesh.volume_mm3 > 0.0
         kind = "closed" if closed else "inside out" if mesh.is_watertight else "open"
+        volume = f"{mesh.volume_mm3 / 1000.0:.4g} ml"
+        if closed and buried_faces(mesh):
+            volume = "overlaps itself, volume unknown"  # its integral counts overlaps twice
         rows.append(
             Finding(
                 f"{body.role} '{body.name}'",
-                f"{len(mesh.faces)} faces, {kind}, {mesh.volume_mm3 / 1000.0:.4g} ml",
+                f"{len(mesh.faces)} faces, {kind}, {volume}",
                 "closed, wound outwards",
                 closed,
             )
@@ -313,7 +323,10 @@ def _lesion_finding(scene: Scene) -> Finding:
     nearest, _ = nearest_on_surface(scene.organ.world_mesh, centre[None])
     off = float(np.linalg.norm(nearest[0] - centre))
     value, lies = f"{off:.3f} mm off", off <= ON_SURFACE_MM
-    if lies:
+    if not lies:
+        there = ", ".join(f"{x:.2f}" for x in nearest[0])
+        value = f"{off:.3f} mm off, nearest is [{there}]"
+    else:
         try:
             scene.ring_of()
         except InputError:
@@ -349,23 +362,40 @@ def _neighbour_findings(scene: Scene, what: str, points_mm: np.ndarray) -> tuple
     return tuple(rows)
 
 
-def _reach_findings(work: Work, what: str) -> list[Finding]:
-    """Which share of a path each laser can cut, and what keeps it from the rest."""
+def _reach_findings(scene: Scene, work: Work, what: str) -> list[Finding]:
+    """Which share of a path each laser can cut, and what keeps it from the rest.
+
+    Where it reaches none of it: by how much it misses the nearest point, or the body in which its
+    base is.
+    """
     rows = []
     for name, reason in work.reasons.items():
         lacking = [
             f"{100 * np.mean(reason == code):.0f} % {REASONS[code]}"
             for code in np.unique(reason[reason > 0])
         ]
+        if (reason == OUT_OF_REACH).all():
+            base = np.asarray(scene.spec.mount(name).position_mm)
+            inside = [body.name for body in scene.bodies if _holds(body, base)]
+            lacking[-1] += (
+                f": its base is inside '{inside[0]}'"
+                if inside
+                else f", the nearest point by {work.cuts[name].missed_mm.min():.3g} mm"
+            )
         whose = "the laser's reach" if len(work.reasons) == 1 else f"reach of {name}"
         covered = ", ".join((f"{100 * np.mean(reason == 0):.0f} %", *lacking))
         rows.append(Finding(f"{what} in {whose}", covered, "100 %", not lacking))
     return rows
 
 
+def _holds(body: Body, point_mm: np.ndarray) -> bool:
+    """Whether a body encloses a point (3,) mm of the world."""
+    return bool(points_inside(body.mesh, frames.apply(frames.invert(body.pose), point_mm[None]))[0])
+
+
 def _work_findings(scene: Scene, work: Work) -> tuple[Finding, ...]:
     limits, (low, high) = scene.spec.limits, scene.spec.camera.range_mm
-    least, rows = float(work.clearance_mm.min()), _reach_findings(work, "ring")
+    least, rows = float(work.clearance_mm.min()), _reach_findings(scene, work, "ring")
     rows.append(
         Finding(
             "clearance at work",
@@ -402,14 +432,39 @@ def _work_findings(scene: Scene, work: Work) -> tuple[Finding, ...]:
 def _way_finding(
     scene: Scene, checker: CollisionChecker, arms: dict[str, MountedArm], work: Work
 ) -> Finding:
-    touching, least, half_step = _ways(checker, arms, work)
-    clearance = scene.spec.limits.clearance_mm
+    return _contacts(scene, "contacts at rest and on the path", *_ways(checker, arms, work))
+
+
+def _contacts(
+    scene: Scene, what: str, touching: list[str], least_mm: float, half_step_mm: float
+) -> Finding:
+    """The line on contacts of arms, and on the clearance that the steps between shapes ask for."""
+    wanted = max(scene.spec.limits.clearance_mm, half_step_mm)
+    near = f"none (closest {least_mm:.1f} mm)"
+    if least_mm < wanted:
+        near = f"too near, {least_mm:.2f} mm"
     return Finding(
-        "contacts at rest and on the path",
-        ", ".join(touching) or f"none (closest {least:.1f} mm)",
-        f"none, {clearance:g} mm clearance",
-        not touching and least >= max(clearance, half_step),
+        what,
+        ", ".join(touching) or near,
+        f"none, {wanted:.3g} mm clearance",
+        not touching and least_mm >= wanted,
     )
+
+
+def _insertion_findings(
+    scene: Scene, checker: CollisionChecker, arms: dict[str, MountedArm]
+) -> list[Finding]:
+    """Contacts while all arms are fed in through the ports of a scene's wall, all by the same way.
+
+    `keyhole_ablation` does so. Without a body named `WALL` nothing is checked.
+    """
+    if WALL not in [body.name for body in scene.bodies]:
+        return []
+    ways = {name: arm.way_in() for name, arm in arms.items()}
+    moments = [dict(zip(ways, lines, strict=True)) for lines in zip(*ways.values(), strict=True)]
+    found = _closest(checker, arms, moments)
+    what = f"insertion through the ports ({FEED_MM:g} mm)"
+    return [_contacts(scene, what, *found, 0.5 * FEED_STEP_MM)]
 
 
 def _view(
@@ -434,7 +489,9 @@ def _view(
     return np.array(fractions)
 
 
-def _ways(checker: CollisionChecker, arms: dict[str, MountedArm], work: Work):
+def _ways(
+    checker: CollisionChecker, arms: dict[str, MountedArm], work: Work
+) -> tuple[list[str], float, float]:
     """Contacts at rest and on the paths to the lesion, endoscopes first; smallest clearance.
 
     Each plain tip goes back to rest before the next arm moves. The third result is half the largest
@@ -456,6 +513,17 @@ def _ways(checker: CollisionChecker, arms: dict[str, MountedArm], work: Work):
         moments += [stand | {name: line} for line in way]
         if name not in work.touches:
             stand[name] = way[-1]
+    steps = [np.linalg.norm(np.diff(way, axis=0), axis=-1).max() for way in ways.values()]
+    return *_closest(checker, arms, moments), 0.5 * float(max(steps))
+
+
+def _closest(
+    checker: CollisionChecker, arms: dict[str, MountedArm], moments: list[dict[str, np.ndarray]]
+) -> tuple[list[str], float]:
+    """Contacts in words, each once, and the smallest clearance (mm) of arms at some moments.
+
+    moments: centrelines (K, 3) mm of each arm by name, world frame.
+    """
     touching: dict[str, None] = {}
     least = np.inf
     for lines in moments:
@@ -463,8 +531,7 @@ def _ways(checker: CollisionChecker, arms: dict[str, MountedArm], work: Work):
         for collision in checker.collisions(shapes):
             touching[f"{collision.arm} touches {collision.other}"] = None
         least = min(least, checker.clearance(shapes).least_mm)
-    steps = [np.linalg.norm(np.diff(way, axis=0), axis=-1).max() for way in ways.values()]
-    return list(touching), float(least), 0.5 * float(max(steps))
+    return list(touching), float(least)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ import numpy as np
 
 from surgisoft.compiled import compiled
 from surgisoft.scene import frames
-from surgisoft.scene.mesh import Mesh
+from surgisoft.scene.mesh import Mesh, kept
 from surgisoft.scene.rays import EmbreeSurface
 
 
@@ -137,6 +137,7 @@ def enclosed(mesh: Mesh, points_mm: np.ndarray, surface: Callable[[], EmbreeSurf
     return inside
 
 
+@kept
 def buried_faces(mesh: Mesh) -> int:
     """How many faces have their middle inside the mesh's own solid."""
     return int(buried(mesh, mesh.triangles_mm.mean(axis=1), mesh.face_normals).sum())

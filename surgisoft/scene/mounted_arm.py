@@ -22,6 +22,12 @@ TOUCH_STEPS = 96
 TOUCH_GAP_MM = 0.5
 """A plain tip has reached the lesion where its skin is this far beyond the scene's least clearance
 from the surface (mm): the last stretch is the contact itself."""
+AXIS_MM = 1000.0
+"""Distance along its base's axis at which an arm that is fed in straight aims (mm)."""
+FEED_MM = 80.0
+"""Way along its axis by which a carriage feeds an arm in through a port (mm)."""
+FEED_STEP_MM = 2.0
+"""Spacing of the places of the base in which the way in is checked (mm)."""
 TOUCHED_MM = 0.5
 """Largest distance of a tip from the place to which it is sent (mm)."""
 
@@ -56,6 +62,14 @@ class MountedArm:
         share = np.linspace(0.0, 1.0, steps)[:, None]
         return (1.0 - share) * self.reach.rest + share * commands
 
+    def way_in(self) -> np.ndarray:
+        """Centrelines (M, K or K + 1, 3) mm with the shaft, world frame: the arm as straight as the
+        scripted expert holds it, fed in by FEED_MM to its mount in steps of FEED_STEP_MM."""
+        ahead = np.array([[0.0, 0.0, AXIS_MM]])
+        straight = solve_aim(self.reach, ahead, np.asarray(self.reach.rest)[None]).commands
+        behind = np.arange(FEED_MM, -FEED_STEP_MM / 2.0, -FEED_STEP_MM)
+        return self.lines(straight)[0] - behind[:, None, None] * self.pose[:3, 2]
+
 
 def placed(lines_mm: np.ndarray, poses: np.ndarray, shaft_mm: float) -> np.ndarray:
     """Centrelines (..., K, 3) mm from base to world frame, starting at the shaft's far end."""
@@ -83,6 +97,9 @@ class RingSolution:
     """(M, 3) of the beam."""
     in_reach: np.ndarray
     """(M,) bool: the axis meets the point at an allowed distance."""
+    missed_mm: np.ndarray
+    """(M,) by how much the axis runs past the point, and the point is beyond the allowed distances
+    (mm), as the root of the sum of squares."""
     standoff_mm: np.ndarray
     """(M,) from the tip to the point (mm)."""
     incidence_rad: np.ndarray
@@ -102,12 +119,16 @@ def solve_ring(arm: MountedArm, ring: Ring, laser: LaserSpec) -> RingSolution:
     lines, directions = arm.lines(aimed.commands)
     low, high = laser.standoff_mm
     incidence = frames.angle_between(-directions, ring.normals)
+    away = ring.points_mm - lines[:, -1]
+    aside = frames.norm(away - frames.dot(away, directions)[:, None] * directions)
+    beyond = aimed.ahead_mm - aimed.ahead_mm.clip(low, high)
     return RingSolution(
         centre=centre,
         commands=aimed.commands,
         lines_mm=lines,
         directions=directions,
         in_reach=aimed.on_target & (aimed.ahead_mm >= low) & (aimed.ahead_mm <= high),
+        missed_mm=np.hypot(aside, beyond),
         standoff_mm=aimed.ahead_mm,
         incidence_rad=incidence,
         steep=incidence > np.radians(laser.max_incidence_deg),

@@ -55,6 +55,8 @@ def spec_file(path: Path) -> Path:
 
 FORMAT = 1
 FILE = "scene.toml"
+WALL = "wall"
+"""Name of the body through whose ports the arms are fed in, in scenes that have one."""
 TOOLS = ("laser", "endoscope", "tip")
 """Tools of an arm: the laser's beam, the endoscope's camera, a plain tip that pushes and touches.
 The order is that of the arms in a world, whatever their order in the file."""

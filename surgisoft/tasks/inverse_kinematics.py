@@ -27,6 +27,7 @@ def least_squares(
     damping: float = 1e-3,
     iterations: int = 5,
     solved: float = 0.0,
+    hold_at_limits: bool = False,
 ) -> Tensor:
     """Minimise residuals (B, r) over (B, m) within low, high (B, m); returns the best point tried.
 
@@ -35,6 +36,10 @@ def least_squares(
     does not lower its residual, else it falls tenfold. The search ends early, but not on a GPU,
     where no environment has a residual longer than `solved`. `residual` maps (B, m) to (B, r) by
     row; slopes cost more than all else here.
+
+    hold_at_limits: leave a coordinate out of the step where it is at its limit and the residual
+    falls beyond. Without this a clipped step, which may lower no residual at any damping, can end
+    the search away from the minimum.
     """
     best = torch.minimum(torch.maximum(start, low), high)
     factor = best.new_full((len(best), 1, 1), damping)
@@ -46,9 +51,13 @@ def least_squares(
             if not best.is_cuda and bool((error.norm(dim=1) <= solved).all()):
                 break
             jacobian = _jacobian(residual, best)
+            pull = (jacobian.mT @ error[..., None])[..., 0]
+            if hold_at_limits:
+                held = ((best <= low) & (pull > 0.0)) | ((best >= high) & (pull < 0.0))
+                jacobian = jacobian.masked_fill(held[:, None], 0.0)
+                pull = pull.masked_fill(held, 0.0)
             normal = jacobian.mT @ jacobian
             size = normal.diagonal(dim1=1, dim2=2).mean(1)[:, None, None].clamp(min=1e-12)
-            pull = (jacobian.mT @ error[..., None])[..., 0]
         move = torch.linalg.solve_ex(normal + factor * size * eye, pull)[0]
         tried = torch.minimum(torch.maximum(best - move, low), high)
         new_error = _value(residual, tried)

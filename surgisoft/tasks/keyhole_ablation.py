@@ -14,6 +14,8 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
+from surgisoft.scene.mounted_arm import AXIS_MM
+from surgisoft.scene.spec import WALL
 from surgisoft.tasks.base import FEED_SIGNAL, Signal, TaskState, clearance
 from surgisoft.tasks.laser_supervision import LASER_EXPERIMENT
 from surgisoft.tasks.laser_work import (
@@ -39,8 +41,6 @@ from surgisoft.tasks.world.world import Feed, WorldConfig
 
 PORTS = PHANTOM / "ports.toml"
 """The liver phantom below a wall with two ports."""
-AXIS_MM = 1000.0
-"""Distance along a port's axis at which the scripted expert aims while the arms enter, mm."""
 
 OUT = Block("out", "distance by which the bases are behind their mounts", "mm", "x / 50", 0.0, 4.0)
 RIM = Block(
@@ -115,7 +115,7 @@ class KeyholeAblationConfig(LaserConfig):
 
     scene: str | Path = PORTS
     """Scene with a wall whose ports the arms `laser` and `endoscope` enter: its folder or file."""
-    wall: str = "wall"
+    wall: str = WALL
     """Name of the wall among the scene's bodies."""
     feed: Feed = field(default_factory=Feed)
     """How the carriages feed the arms in."""
@@ -173,7 +173,9 @@ class KeyholeAblation(RingTask[PortCut]):
         if c.wall not in names:
             raise InputError(
                 f"scene '{self.spec.name}' has the bodies {', '.join(names)}, expected the wall "
-                f"'{c.wall}' among them"
+                f"'{c.wall}' among them: add [[bodies]] with this name, a mesh with a port around "
+                'the axis of each arm and role = "keep-out", or give the name of another body as '
+                "`wall` in --config (docs/scenes.md, Walls and ports)"
             )
         self._wall = names.index(c.wall)
 

@@ -46,6 +46,10 @@ REACH_POINTS = 40
 """Points of a path that are compared with the arm's reach (a count)."""
 REACHED_MM = 0.1
 """Distance from which a point of a path counts as out of reach, mm: the scale of fine errors."""
+REACH_STARTS = 16
+"""Places of a grid from which the nearest shape is searched for a point out of reach (a count)."""
+REACH_GAIN_MM = 1e-3
+"""A further search for the nearest shape has to come nearer by this much, mm."""
 
 SHAPE = Block("shape", "measured key points relative to their rest positions", "mm", "x / 10")
 ERROR = Block("error", "target minus measured point", "mm", "asinh(x / 1 mm)")
@@ -223,29 +227,53 @@ class Follow:
     def out_of_reach_mm(self) -> Tensor:
         """(K,) mm: distance of points along the path from the nearest that the arm reaches.
 
-        In steady states of the model without history, over the whole ranges of its chambers: the
-        nearest of a grid, then damped least squares. Raises InputError for an arm of more than six
-        chambers.
+        In steady states of the model without history, over the whole ranges of its chambers: damped
+        least squares from the nearest of a grid. A search can end at the limit of a chamber, away
+        from the nearest shape: where more than REACHED_MM remains it starts again, from the
+        REACH_STARTS nearest of the grid and from what was found for the points before and behind,
+        until these come no nearer. Raises InputError for an arm of more than six chambers.
         """
         spec = self.arm.model.spec
         share = torch.linspace(0.0, 1.0, REACH_POINTS + 1, device=self.centre.device)[:-1]
         flat = self.config.size_mm * PATHS[self.config.path](share)
         target = self.centre + torch.nn.functional.pad(flat, (0, 1))
-        tried = actuation_grid(spec).to(target) / units_per_kPa(spec)
+        grid = actuation_grid(spec).to(target) / units_per_kPa(spec)
+        low, high = grid.amin(0), grid.amax(0)
 
         def point(pressure: Tensor) -> Tensor:
             points = self.arm.settled(pressure)
             return self.marker(points, self.arm.pose.expand(len(points), 4, 4))
 
-        with torch.inference_mode(False):
-            with torch.no_grad():
-                nearest = torch.cdist(target, point(tried)).argmin(1)
-            low, high = (edge.expand(len(target), -1) for edge in (tried.amin(0), tried.amax(0)))
-            best = least_squares(
-                lambda pressure: point(pressure) - target, tried[nearest], low, high, iterations=20
+        def nearest(rows: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
+            """Best pressures (R, m) for R points from starts (R, S, m), and distances (R,) mm."""
+            wanted = target[rows].repeat_interleave(starts.shape[1], 0)
+            tried = starts.flatten(0, 1)
+            bounds = (edge.expand(len(tried), -1) for edge in (low, high))
+            found = least_squares(
+                lambda pressure: point(pressure) - wanted,
+                tried,
+                *bounds,
+                iterations=20,
+                hold_at_limits=True,
             )
-            with torch.no_grad():
-                return (point(best) - target).norm(dim=1)
+            off, which = (point(found) - wanted).norm(dim=1).unflatten(0, (len(rows), -1)).min(1)
+            return found.view_as(starts)[torch.arange(len(rows), device=rows.device), which], off
+
+        with torch.inference_mode(False), torch.no_grad():
+            places = torch.cdist(target, point(grid))
+            near = places.topk(min(REACH_STARTS, len(grid)), dim=1, largest=False).indices
+            everywhere = torch.arange(len(target), device=target.device)
+            best, off = nearest(everywhere, grid[near[:, :1]])
+            starts = grid[near]
+            while len(rows := (off > REACHED_MM).nonzero()[:, 0]):
+                found, missed = nearest(rows, starts[rows])
+                gained = missed < off[rows] - REACH_GAIN_MM
+                if not gained.any():
+                    break
+                best = best.index_copy(0, rows, found.where(gained[:, None], best[rows]))
+                off = off.index_copy(0, rows, missed.where(gained, off[rows]))
+                starts = torch.stack((best.roll(1, 0), best.roll(-1, 0)), 1)
+            return off
 
     def error_mm(self, state: TaskState[FollowGoal]) -> Tensor:
         """(B,) mm: distance of the true point from its target."""

@@ -28,6 +28,27 @@ arm = Arm()
 """
 """An arm of two chambers whose tip moves on a line: x from -60 to 60 mm, y = 0, z = 70 mm."""
 
+OPPOSED = """
+import numpy as np
+
+class Arm:
+    static = True
+    low, high, error_mm = (0.0,) * 4, (60.0,) * 4, 0.5
+
+    def __call__(self, time_s, kPa):
+        bend = (kPa[:, :2] - kPa[:, 2:]) * 3e-4
+        length = 60.0 + 0.02 * kPa.sum(1)
+        curvature = np.hypot(bend[:, 0], bend[:, 1]) + 1e-9
+        angle = np.linspace(0, 1, 5) * (length * curvature)[:, None]
+        aside = (1 - np.cos(angle)) / curvature[:, None]
+        across = aside[..., None] * (bend / curvature[:, None])[:, None]
+        along = np.sin(angle) / curvature[:, None]
+        return np.concatenate([across, along[..., None]], axis=-1)
+
+arm = Arm()
+"""
+"""An arm of constant curvature and four opposed chambers; where one is at 0 the other bends."""
+
 
 @pytest.fixture
 def flat(tmp_path):
@@ -48,6 +69,16 @@ def test_the_distance_of_a_circle_from_a_line(flat):
 @pytest.mark.parametrize("task", ["track_circle", "track_square", "laser_plane"])
 def test_the_default_arm_reaches_its_paths(task):
     assert make_task(task).out_of_reach_mm().max() < 0.01
+
+
+@pytest.mark.parametrize("size_mm", [20.0, 30.0])
+def test_opposed_chambers_at_their_lower_limits_reach_a_circle(tmp_path, size_mm):
+    """15 mm aside at the path's height of 61.6 mm the arc bends by 2 atan(15 / 61.6) = 0.48 and is
+    64.0 mm long: the chambers of a pair differ by 25 kPa and all four sum to 200 of 240 kPa."""
+    file = tmp_path / "opposed.py"
+    file.write_text(OPPOSED)
+    task = track_circle(TrackConfig(FollowConfig(arm=f"{file}:arm", size_mm=size_mm)))
+    assert task.out_of_reach_mm().max() < 0.01
 
 
 def test_evaluate_warns_of_a_path_out_of_reach(flat, capsys):

@@ -15,9 +15,16 @@ from rerun.chunk import RrdReader
 
 from surgisoft.cli import run
 from surgisoft.errors import InputError
+from surgisoft.replay.reach_map import check_map
 from surgisoft.replay.shapes import carried_frames, finer, polar_patch, tube, view_cone
 from surgisoft.replay.show import open_replay
-from surgisoft.replay.viewer import free_port, serve_viewer, take_screenshot, web_address
+from surgisoft.replay.viewer import (
+    check_picture,
+    free_port,
+    serve_viewer,
+    take_screenshot,
+    web_address,
+)
 from surgisoft.scene.folder import open_scene
 from surgisoft.scene.mesh import Mesh
 from tests.replay.reading import column
@@ -148,9 +155,19 @@ def test_a_picture_without_a_display_shows_the_liver(recording, tmp_path):
 def test_what_cannot_be_drawn_to_is_one_line(recording, tmp_path):
     with pytest.raises(InputError, match=r"expected \.png"):
         take_screenshot(recording, tmp_path / "scene.jpg")
-    with pytest.raises(InputError, match="no such folder"):
-        take_screenshot(recording, tmp_path / "none" / "scene.png")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="file is not a writable folder"):
+        take_screenshot(recording, tmp_path / "file" / "scene.png")
     assert run(["scene", "show", str(PHANTOM), "--save", str(tmp_path / "scene.txt")]) == 2
+
+
+def test_the_folder_of_a_picture_is_made(tmp_path):
+    """As that of every other file that is written."""
+    check_picture(tmp_path / "new" / "scene.png")
+    check_map(open_scene(PHANTOM), tmp_path / "new" / "map.png")
+    for check in (check_picture, lambda path: check_map(open_scene(PHANTOM), path)):
+        with pytest.raises(InputError, match="is not a writable folder"):
+            check(Path("/dev/null/scene.png"))
 
 
 def test_only_this_machine_is_served():

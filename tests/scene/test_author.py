@@ -47,7 +47,7 @@ from surgisoft.surrogate.networks import ConstantCurvature
 from surgisoft.tasks.world.arm import Pneumatics, Randomisation
 from surgisoft.tasks.world.authoring import make_scene
 from surgisoft.tasks.world.random_streams import streams
-from surgisoft.tasks.world.reach import blank_mounts, reaches_of
+from surgisoft.tasks.world.reach import blank_mounts, reach_of, reaches_of
 from surgisoft.tasks.world.world import WorldConfig, scene_world, single_arm_world
 from tests.scene.shapes import ball, box, lumpy
 
@@ -234,6 +234,48 @@ def test_a_mount_moved_into_the_organ_is_found(made, tmp_path):
     assert not verdict.good
     assert "laser touches organ" in sentence(verdict)
     assert run(["scene", "check", str(folder)]) == 1
+
+
+def reach_of_laser_at(made, folder, position_mm):
+    """The line on the laser's reach with its base at another place."""
+    scene = open_scene(made[1])
+    laser = dataclasses.replace(scene.spec.mount("laser"), position_mm=tuple(position_mm))
+    scene = open_scene(scene_with(made, folder, mounts=(laser, scene.spec.mount("endoscope"))))
+    return finding(check_scene(scene, reaches_of(scene)), "ring in the laser's reach").value
+
+
+def test_a_laser_out_of_reach_is_told_by_how_much(made, tmp_path):
+    """1 m behind its mount: the arm is 70 to 85 mm long and the beam at most 60 mm."""
+    scene = open_scene(made[1])
+    mount = scene.spec.mount("laser")
+    direction = np.array(mount.direction) / np.linalg.norm(mount.direction)
+    base = np.array(mount.position_mm) - 1000.0 * direction
+    value = reach_of_laser_at(made, tmp_path, base)
+    told = float(re.search(r"100 % out of reach, the nearest point by (\S+) mm", value)[1])
+    away = np.linalg.norm(scene.ring.points_mm - base, axis=1).min()
+    assert away - 85.0 - 60.0 < told < away - 70.0 - 60.0
+
+
+def test_a_base_inside_a_body_is_named(made, tmp_path):
+    """In the organ's middle, with the lesion behind it."""
+    value = reach_of_laser_at(made, tmp_path, (0.0, 0.0, 0.0))
+    assert value.endswith("100 % out of reach: its base is inside 'organ'")
+
+
+@pytest.mark.parametrize("off_mm", [2.0, 30.0])
+def test_a_lesion_off_the_surface_is_told_the_point_that_lies_on_it(made, tmp_path, off_mm):
+    """Above the lesion of before, along its normal: that is the nearest point, or a nearer one."""
+    scene = open_scene(made[1])
+    centre = np.array(scene.spec.lesion.centre_mm) + off_mm * scene.ring.normal
+    folder = scene_with(made, tmp_path, lesion=LesionSpec("organ", tuple(centre.tolist())))
+    value = finding(check_scene(open_scene(folder), {}), "lesion on the surface").value
+    off, typed = re.fullmatch(r"(\S+) mm off, nearest is \[(.*)\]", value).groups()
+    point = tuple(float(x) for x in typed.split(", "))
+    assert np.linalg.norm(centre - point) == pytest.approx(float(off), abs=0.02)
+    assert float(off) <= off_mm
+    again = scene_with(made, tmp_path, lesion=LesionSpec("organ", point, 5.0))
+    scene = open_scene(again)
+    assert finding(check_scene(scene, reaches_of(scene)), "lesion on the surface").good
 
 
 def test_a_lesion_out_of_reach_is_told_why(made, tmp_path):
@@ -684,6 +726,42 @@ def test_a_second_file_has_a_unit_and_an_up_of_its_own(tmp_path):
     np.testing.assert_allclose(vessel.bounds_mm, [[-50, -30, 180], [50, 30, 220]], atol=1e-3)
 
 
+@pytest.mark.parametrize(("unit", "scale", "told"), [("m", 1.0, "error"), ("mm", 1000.0, "note")])
+def test_a_further_body_in_another_unit_is_told(tmp_path, unit, scale, told):
+    """A vessel of 60 mm, 25 mm beside an organ of 100 mm at 900 mm from the origin: in mm beside an
+    organ in metres it is 60 m long and an error; in metres beside an organ in mm it is a speck at
+    the origin, 0.9 m less 50 mm away."""
+    organ = trimesh.creation.box((0.1, 0.1, 0.1))
+    vessel = trimesh.creation.box((0.01, 0.06, 0.01))
+    vessel.apply_translation((0.08, 0.0, 0.0))
+    for shape, factor in ((organ, scale), (vessel, 1000.0 / scale)):
+        shape.apply_translation((0.0, 0.0, 0.9))
+        shape.apply_scale(factor)
+    organ.export(tmp_path / "organ.stl")
+    vessel.export(tmp_path / "vessel.stl")
+    files = tmp_path / "organ.stl", tmp_path / "vessel.stl"
+    request = Request(files, ("organ", "keep-out"), unit=unit)
+    if told == "error":
+        with pytest.raises(
+            InputError, match=r"60000 mm across .* in mm .* 60 mm across and about 25 mm"
+        ):
+            prepare(request)
+    else:
+        said = next(note for note in prepare(request).notes if "vessel.stl: unit" in note)
+        assert "0.06 mm across and about 849 mm away from the organ, which is 100 mm across" in said
+        assert "in m it would be 60 mm across and about 25 mm away" in said
+
+
+def test_a_body_beside_the_organ_in_its_unit_is_not_doubted(tmp_path):
+    for name, size, x in (("organ", 100.0, 0.0), ("table", 700.0, 410.0)):
+        shape = trimesh.creation.box((size,) * 3)
+        shape.apply_translation((x, 0.0, 0.0))
+        shape.export(tmp_path / f"{name}.stl")
+    files = tmp_path / "organ.stl", tmp_path / "table.stl"
+    notes = prepare(Request(files, ("organ", "support"))).notes
+    assert f"table.stl: unit that of {files[0].name}" in notes
+
+
 def test_the_organ_is_the_largest_body_of_its_file(tmp_path):
     """A node of 20 mm comes before the organ of 80 mm."""
     scene = trimesh.Scene()
@@ -751,6 +829,35 @@ def test_a_callable_arm_becomes_a_scenes_arm_as_a_folder(tmp_path, monkeypatch, 
     assert (mount.length_mm, mount.diameter_mm) == (42.0, 9.0)
     assert mount.arm == str(tmp_path / "my_arm")
     assert not (tmp_path / "scene").exists()
+
+
+@pytest.mark.parametrize(
+    ("length_mm", "body", "told"),
+    [
+        (60.0, 0.06, "in m: along the body, base to tip, they are 0.06 long, where the arm is 60"),
+        (60.0, 6.0, "in cm: along the body, base to tip, they are 6 long, where the arm is 60 mm"),
+        (0.06, 0.06, "in m: along the body, base to tip, they are 0.06 long, where an arm is 3 mm"),
+    ],
+)
+def test_an_arm_in_another_unit_of_length_gets_no_mount(tmp_path, length_mm, body, told):
+    """As `compare` says it; also of an arm whose stated length is in that unit."""
+    file = tmp_path / "straight.py"
+    file.write_text(
+        "import numpy as np\n"
+        "class Arm:\n"
+        "    static, error_mm = True, 1.0\n"
+        "    low, high = (0.0, 0.0), (50.0, 50.0)\n"
+        f"    length_mm = {length_mm}\n"
+        "    def __call__(self, time_s, actuation):\n"
+        f"        line = np.linspace(0.0, {body}, 4)[None, :, None] * np.array([0.0, 0.0, 1.0])\n"
+        "        return np.tile(line, (len(actuation), 1, 1))\n"
+        "arm = Arm()\n"
+    )
+    save_model(load_model(f"{file}:arm"), tmp_path / "arm")
+    mount = blank_mounts(models={"laser": str(tmp_path / "arm")})["laser"]
+    with pytest.raises(InputError, match=re.escape(f"arm: returns key points {told}")) as error:
+        reach_of(mount)
+    assert f"expected mm: multiply them by {10 if body == 6.0 else 1000}" in str(error.value)
 
 
 def test_an_existing_folder_is_kept(made, tmp_path, capsys):

@@ -1,5 +1,7 @@
 """Self-intersecting surfaces: the part inside is known in closed form and receives no dose."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -10,12 +12,15 @@ from hypothesis import strategies as st
 from surgisoft.scene import frames, inside
 from surgisoft.scene.ablation import AblationMap
 from surgisoft.scene.author import CROSSING, Request, prepare
+from surgisoft.scene.check import check_scene
 from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.dose_patch import cut_patch
+from surgisoft.scene.folder import Scene
 from surgisoft.scene.inside import buried, buried_faces, winding_numbers
 from surgisoft.scene.mesh import Body, Mesh
 from surgisoft.scene.meshio import write_ply
 from surgisoft.scene.rays import EmbreeSurface
+from surgisoft.scene.spec import BodySpec, LesionSpec, MountSpec, SceneSpec
 from tests.scene.shapes import lumpy
 
 AXES = np.array([40.0, 30.0, 30.0])
@@ -99,6 +104,23 @@ def test_the_author_says_that_surfaces_cross(tmp_path):
     assert not any(
         CROSSING in x for x in prepare(Request((tmp_path / "one.ply",), ("organ",))).notes
     )
+
+
+def test_no_volume_is_told_of_a_body_that_overlaps_itself():
+    """One ellipsoid has 4/3 pi 40 30 30 mm3; of two the integral over the surface is twice that,
+    although they share a part."""
+    solid, ellipsoids = trimesh.creation.icosphere(subdivisions=5), crossing(5)
+    one = Mesh(solid.vertices * AXES, solid.faces)
+    lesion = LesionSpec("one", (0.0, 0.0, 999.0))
+    names = [BodySpec(name, f"{name}.ply", "organ") for name in ("one", "two")]
+    mount = MountSpec("laser", (0.0, 0.0, 100.0), (0.0, 0.0, -1.0))
+    bodies = tuple(Body(*each) for each in (("one", "organ", one), ("two", "organ", ellipsoids)))
+    scene = Scene(SceneSpec("two", tuple(names), lesion, (mount,)), Path(), bodies)
+    found = {finding.what: finding for finding in check_scene(scene, {}).findings}
+    volume_ml = float(found["organ 'one'"].value.removesuffix(" ml").split()[-1])
+    assert volume_ml == pytest.approx(4e-3 / 3 * np.pi * 40 * 30 * 30, rel=2e-3)
+    assert found["organ 'two'"].value.endswith("closed, overlaps itself, volume unknown")
+    assert found["organ 'two'"].good
 
 
 @pytest.mark.parametrize("aside", [0.0, 0.15, 0.4])

@@ -263,6 +263,20 @@ def module(tmp_path, monkeypatch):
     return tmp_path
 
 
+def test_the_code_to_name_is_where_its_file_is(module, monkeypatch):
+    """A model saved in `arms/`, beside its file, is opened from the folder above."""
+    (module / "arms").mkdir()
+    (module / "lab_arm.py").rename(module / "arms" / "lab_arm.py")
+    monkeypatch.chdir(module / "arms")
+    save_model(load_model("lab_arm.py:arm"), "saved")
+    named.NAMED.clear()
+    monkeypatch.chdir(module)
+    with pytest.raises(InputError, match=r"code, lab_arm\.py:arm") as refused:
+        load_model("arms/saved")
+    assert "--model-code arms/lab_arm.py:arm (in" in str(refused.value)
+    assert load_model("arms/saved", model_code=["arms/lab_arm.py:arm"]).spec.chambers == 2
+
+
 @pytest.mark.parametrize("name", ["lab_arm:arm", "lab_arm.py:arm", "lab_arm:Arm"])
 def test_a_saved_model_opens_once_its_callable_is_named(module, name):
     assert is_callable_name(name)

@@ -58,3 +58,21 @@ def test_a_row_that_is_solved_does_not_hold_the_others():
     low, high = torch.zeros_like(start), torch.full_like(start, 10.0)
     found = least_squares(lambda x: x.square() - target, start, low, high, iterations=8)
     torch.testing.assert_close(found, target.sqrt(), rtol=0.0, atol=1e-5)
+
+
+def test_a_search_along_a_limit_ends_at_the_minimum_there():
+    """The minimum of |A x - b| over x >= 0 lies on the limit x_0 = 0, where a line of one unknown
+    has its own. Steps for both unknowns that are clipped to the limit end beside it."""
+    matrix = torch.tensor([[1.0, 1.0], [0.0, 0.1]])
+    wanted = matrix @ torch.tensor([-30.0, 33.5])
+    start, low, high = torch.tensor([[0.0, 2.0]]), torch.zeros(1, 2), torch.full((1, 2), 100.0)
+
+    def residual(x):
+        return x @ matrix.mT - wanted
+
+    by_hand = (matrix[:, 1] @ wanted) / matrix[:, 1].square().sum()
+    found = least_squares(residual, start, low, high, iterations=20, hold_at_limits=True)
+    assert found[0, 0] == 0.0
+    assert found[0, 1].item() == pytest.approx(by_hand.item(), abs=1e-3)
+    clipped = least_squares(residual, start, low, high, iterations=20)
+    assert abs(clipped[0, 1].item() - by_hand.item()) > 0.1

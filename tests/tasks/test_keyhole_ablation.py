@@ -1,15 +1,21 @@
 """Two arms through the ports of a wall: the feed, the scripted expert, the rims and success."""
 
+import re
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from surgisoft.errors import InputError
+from surgisoft.scene.check import check_scene
+from surgisoft.scene.folder import open_scene
 from surgisoft.scene.spec import PHANTOM
 from surgisoft.tasks.base import Episodes
-from surgisoft.tasks.keyhole_ablation import KeyholeAblation, KeyholeAblationConfig
+from surgisoft.tasks.keyhole_ablation import PORTS, KeyholeAblation, KeyholeAblationConfig
+from surgisoft.tasks.world.reach import reaches_of
 from surgisoft.tasks.world.world import Feed
 from tests.tasks.scripted import scripted_states
 
@@ -42,6 +48,36 @@ def test_the_script_enters_looks_and_cuts(quick, cut):
         assert min(o.measures["rim_mm"][i] for o in outcomes[: end + 1]) > quick.config.rim_mm
     fired = torch.stack([state.goal.fired for state in states])
     assert not fired[:46].any(), "no beam before the arms are in"
+
+
+def insertion(scene):
+    """The line of `scene check` on the way in."""
+    findings = check_scene(scene, reaches_of(scene)).findings
+    return next(finding for finding in findings if finding.what.startswith("insertion"))
+
+
+def test_the_check_knows_the_distance_that_the_script_keeps_on_the_way_in(quick, cut):
+    """At the mounts the bodies are 3 mm from the rims, on the way in 2 mm."""
+    states, outcomes = cut
+    entering = [i for i, state in enumerate(states[1:]) if (quick.out_mm(state) > 0.0).all()]
+    least = min(float(outcomes[i].measures["rim_mm"].min()) for i in entering)
+    found = insertion(open_scene(PORTS))
+    assert found.good
+    told = float(found.value.removeprefix("none (closest ").removesuffix(" mm)"))
+    assert told == pytest.approx(least, abs=0.1)
+
+
+@pytest.mark.parametrize(("wider_mm", "told"), [(1.25, "too near, 0.7"), (2.5, "touches wall")])
+def test_the_check_refuses_ports_that_are_too_narrow_for_the_way_in(wider_mm, told):
+    """The script keeps 2.03 mm: arms with a larger radius come so much nearer."""
+    scene = open_scene(PORTS)
+    mounts = tuple(
+        replace(mount, diameter_mm=mount.diameter_mm + 2.0 * wider_mm)
+        for mount in scene.spec.mounts
+    )
+    found = insertion(replace(scene, spec=replace(scene.spec, mounts=mounts)))
+    assert not found.good
+    assert told in found.value
 
 
 def test_no_beam_while_the_arms_are_fed_in(quick, cut):
@@ -155,8 +191,25 @@ def test_a_bent_arm_meets_the_rim_on_its_way_in(quick):
     assert max(off.values()) > 4.0, "the port leaves 4.5 mm on each side"
 
 
+def test_the_manuals_wall_makes_a_scene_of_the_task(tmp_path):
+    """Its block, appended to the phantom's scene, whose folder has the mesh."""
+    manual = (Path(__file__).resolve().parents[2] / "docs" / "scenes.md").read_text()
+    section = manual.partition("## Walls and ports")[2].partition("## From Python")[0]
+    (block,) = re.findall(r"```toml\n(.*?)```", section, re.S)
+    shutil.copytree(PHANTOM, tmp_path / "scene")
+    file = tmp_path / "scene" / "scene.toml"
+    file.write_text(file.read_text().partition("[[contours]]")[0] + block)
+    assert insertion(open_scene(file.parent)).good
+    task = KeyholeAblation(KeyholeAblationConfig(scene=file.parent))
+    state = Episodes(task).seeded(0, 1)
+    assert task.out_mm(state).tolist() == [80.0]
+    assert min(float(rim) for rim in task.rims_mm(state).values()) > 5.0
+
+
 def test_wrong_scenes_and_numbers_are_one_line():
-    with pytest.raises(InputError, match="liver, gallbladder, tray, expected the wall 'wall'"):
+    with pytest.raises(
+        InputError, match=r"liver, gallbladder, tray, expected the wall 'wall'.*add \[\[bodies"
+    ):
         KeyholeAblation(KeyholeAblationConfig(scene=PHANTOM))
     with pytest.raises(InputError, match="rim_mm is 0"):
         KeyholeAblationConfig(rim_mm=0.0)

@@ -152,10 +152,11 @@ def stored_callable(name: str, sha256: str | None, label: str) -> Named:
     if not alike and ":" not in name and name in offered():
         alike = [named_callable(name)]
     if not alike:
+        place = _placed(name, label)
         raise InputError(
             f"{label}: its model is code, {name}, which opening a folder does not import; if you "
-            f"trust it, name it: --model-code {name} (in Python: "
-            f"load_model(folder, model_code=['{name}']))"
+            f"trust it, name it: --model-code {place} (in Python: "
+            f"load_model(folder, model_code=['{place}']))"
         )
     found = alike[0]
     if sha256 is not None and found.sha256 != sha256:
@@ -165,6 +166,16 @@ def stored_callable(name: str, sha256: str | None, label: str) -> Named:
             "amend the model again"
         )
     return found
+
+
+def _placed(name: str, folder: str) -> str:
+    """The name of a callable with the path of its file where that is beside or in the model's
+    folder and not where the name has it; else the name as it is."""
+    head, colon, attribute = name.rpartition(":")
+    places = [Path(folder).parent / head, Path(folder) / head]
+    if head.endswith(".py") and not Path(head).is_file():
+        name = next((f"{each}{colon}{attribute}" for each in places if each.is_file()), name)
+    return name
 
 
 def name_callables(names: Iterable[str]) -> None:

@@ -26,9 +26,15 @@ from surgisoft.surrogate.checkpoint import default_arm, load_model
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.reach import grid_axes, model_table
 from surgisoft.tasks.world.scene import SceneEngineConfig
+from surgisoft.units import MM_PER
 
 SAME_LENGTH_MM = 1.0
 """A mount's length may differ by this from its model's (mm)."""
+LEAST_BODY_MM = 3.0
+"""A body below this length, at rest, is in another unit than mm: no arm with a tool is so short."""
+SAME_LENGTH = 1.5
+"""Ratio up to which the body of a model has the length that the model states, once a wrong unit is
+corrected: an arm that stretches is longer than at rest."""
 
 
 def reach_of(mount: MountSpec, folder: Path | None = None, where: Where | None = None) -> ArmReach:
@@ -41,6 +47,7 @@ def reach_of(mount: MountSpec, folder: Path | None = None, where: Where | None =
     """
     place = _model_folder(mount, folder, where)
     (axes, lines, directions), spec = _default_table() if place is None else _table(place)
+    _check_millimetres(mount.arm, lines, spec)
     _check_length(mount, spec, where)
     return ArmReach(axes, lines, directions, np.array(spec.rest), 0.5 * mount.diameter_mm)
 
@@ -168,6 +175,30 @@ def _model_folder(mount: MountSpec, folder: Path | None, where: Where | None) ->
         came = f"there is no arm model '{mount.arm}'"
         raise _error(mount, where, "arm", came, "'default' or a fitted model's folder")
     return found
+
+
+def _check_millimetres(model: str, lines_mm: np.ndarray, spec: ArmSpec) -> None:
+    """Raise where the centrelines (N, K, 3) of a model are in another unit of length than mm.
+
+    They are where a unit brings their length to the one that the model states, or where they are
+    too short for an arm: then metres or another unit stand for mm in both.
+    """
+    body = float(np.median(np.linalg.norm(np.diff(lines_mm, axis=1), axis=-1).sum(axis=1)))
+    came = f"{model}: returns key points in {{}}: along the body, base to tip, they are {body:.3g}"
+    advice = "expected mm: multiply them by {:g}"
+    for unit, by in MM_PER.items():
+        stated = spec.length_mm
+        if by > 1.0 and stated and abs(np.log(by * body / stated)) < np.log(SAME_LENGTH):
+            raise InputError(
+                f"{came.format(unit)} long, where the arm is {stated:.4g} mm long; "
+                f"{advice.format(by)}"
+            )
+    if body < LEAST_BODY_MM:
+        unit = "m" if body < 1.0 else "cm"
+        raise InputError(
+            f"{came.format(unit)} long, where an arm is {LEAST_BODY_MM:g} mm long or more; "
+            f"{advice.format(MM_PER[unit])}, and so its length_mm"
+        )
 
 
 def _check_length(mount: MountSpec, spec: ArmSpec, where: Where | None) -> None:

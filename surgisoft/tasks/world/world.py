@@ -20,6 +20,7 @@ from torch import Tensor
 from surgisoft.command_line import typed
 from surgisoft.errors import AssumptionWarning, InputError
 from surgisoft.scene.folder import Scene, open_scene
+from surgisoft.scene.mounted_arm import FEED_MM
 from surgisoft.scene.spec import MountSpec
 from surgisoft.surrogate.backbone import TIP_TASKS
 from surgisoft.surrogate.checkpoint import default_arm, load_model
@@ -84,7 +85,7 @@ class WorldConfig:
 class Feed:
     """Carriages that feed all arms in along their axes at the beginning of an episode."""
 
-    way_mm: float = 80.0
+    way_mm: float = FEED_MM
     """Distance of each base behind its mount when an episode begins, mm."""
     speed_mm_s: float = 10.0
     """Speed of the feed until the bases are at their mounts, mm/s."""

@@ -279,7 +279,7 @@ def _sweeps(results: Results) -> list[Section]:
     """A section for each number that varies: success and error over it."""
     sections, known = [], _known(results)
     for vary in results.experiment.vary:
-        if any(isinstance(value, str) for value in vary.values) or len(vary.values) < 2:
+        if len(vary.values) < 2 or any(isinstance(each, str | tuple) for each in vary.values):
             continue
         charts = [
             sweep_chart(vary.field, known[name], _lines(results, vary.field, name))

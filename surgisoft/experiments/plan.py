@@ -29,7 +29,7 @@ from surgisoft.scene.folder import Scene, open_scene
 from surgisoft.scene.lesion import distance_from_ring_mm
 from surgisoft.tasks.registry import with_fields, with_present_names
 
-Value = int | float | str
+Value = int | float | str | tuple[int | float, ...]
 MOST_SETTINGS = 100_000
 """Most settings of an experiment."""
 LONGEST_LABEL = 200
@@ -64,11 +64,25 @@ class Setting:
     def words(self) -> str:
         """Label of the setting in words."""
         parts = [self.case.name, *([self.lesion.name] if self.lesion else [])]
-        return ", ".join([*parts, *(f"{f.split('.')[-1]} {v}" for f, v in self.values)])
+        return ", ".join([*parts, *(f"{f.split('.')[-1]} {in_words(v)}" for f, v in self.values)])
+
+    @property
+    def columns(self) -> dict[str, int | float | str]:
+        """Varied fields and their values for a row of results; several numbers as one text."""
+        return {f: in_words(v) if isinstance(v, tuple) else v for f, v in self.values}
+
+
+def in_words(value: Value) -> str:
+    """A value as text, several numbers as `[2, 10]`."""
+    if not isinstance(value, tuple):
+        return f"{value}"
+    return f"[{', '.join(f'{number:.15g}' for number in value)}]"
 
 
 def _short(value: Value) -> str:
     """A value in characters of a file's name; a number from `LARGE` on with all of its digits."""
+    if isinstance(value, tuple):
+        return "-".join(map(_short, value))
     if isinstance(value, str):
         text = Path(value).name
     else:
@@ -128,7 +142,7 @@ def _check_vary(spec: Experiment, vary: Vary, place: Where) -> None:
             raise (place / "field").error(
                 f"unknown effect '{name}'", f"one of {', '.join(sorted(HIDDEN))}"
             )
-        bad = [value for value in vary.values if isinstance(value, str) or value < 0]
+        bad = [v for v in vary.values if not isinstance(v, int | float) or v < 0]
         if bad:
             raise (place / "values").error(f"got {bad[0]!r}", "amplitudes from 0")
     elif top == "fault" and name in ("chamber", "at_s") and spec.faults:

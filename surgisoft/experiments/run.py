@@ -583,7 +583,7 @@ def _rows(
     table |= _timings(task, result)
     about: Row = {"setting": setting.label, "case": setting.case.name}
     about |= {"lesion": setting.lesion.name} if setting.lesion else {}
-    about |= dict(setting.values)
+    about |= setting.columns
     outcomes = _outcomes(task, result, checks)
     return [
         about

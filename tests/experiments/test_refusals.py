@@ -53,6 +53,7 @@ def spec_of(folder, text: str = TINY):
         ("task.fire_mm", "1.0, 1.0", "'simulation_fire_mm=1' appears twice; expected values that"),
         ("hidden.creep", "-1.0", "got -1.0; expected amplitudes from 0"),
         ("hidden.creep", '"much"', "got 'much'; expected amplitudes from 0"),
+        ("hidden.creep", "[1.0, 2.0]", "got (1.0, 2.0); expected amplitudes from 0"),
         ("fault.chamber", "0", "got 0; expected what a fault has as chamber"),
         ("fault.at_s", "-0.5", "got -0.5; expected what a fault has as at_s"),
     ],

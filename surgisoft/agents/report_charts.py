@@ -73,10 +73,13 @@ def path_chart(log: EpisodeLog, title: str = "path over target") -> Picture:
 
 
 def error_chart(log: EpisodeLog) -> Picture | None:
-    """The distance from the reference over time; with a beam, only while it is on."""
-    named = log.measures.get("beam_error_mm")
-    error = log.error_mm if named is None else named
-    error = _drawable(error)
+    """The distance from the reference over time; with a beam, only while it is on.
+
+    On an organ that moves it is the distance on the tissue.
+    """
+    tissue = log.measures.get("tissue_error_mm")
+    named = log.measures.get("beam_error_mm") if tissue is None else tissue
+    error = _drawable(log.error_mm if named is None else named)
     if np.isnan(error).all():
         return None
     largest = float(np.nanmax(error))
@@ -87,7 +90,8 @@ def error_chart(log: EpisodeLog) -> Picture | None:
         axis.set_xlim(0.0, log.time_s[-1])
         axis.set_xlabel("time [s]")
         axis.set_ylabel("error [mm]")
-        axis.set_title("error over time" + (" while the beam is on" if log.beams else ""))
+        title = "error over time" if tissue is None else "error on the tissue"
+        axis.set_title(title + (" while the beam is on" if log.beams else ""))
         return chart(figure, "error over time", f"Largest {largest:.3g} mm")
 
 

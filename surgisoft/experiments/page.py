@@ -14,7 +14,7 @@ from surgisoft.experiments.plan import configured
 from surgisoft.experiments.results import Results, SettingResult
 from surgisoft.experiments.spec import Experiment
 from surgisoft.report import Facts, Gallery, Page, Picture, Section, Share, Table, Text
-from surgisoft.tasks.supervision import Row
+from surgisoft.tasks.supervision import MEAN_MM, Row, main_error
 
 SHOWN = 4
 """Most settings of which the first episode is shown."""
@@ -131,10 +131,10 @@ def _beams(results: Results) -> bool:
 def _one(setting: SettingResult) -> str:
     success = setting.overall["success"]
     text = f"success {round(success.mean * success.episodes)} of {success.episodes}"
-    for name, title in (("beam_error_mean_mm", "beam error"), ("error_mean_mm", "error")):
-        error = setting.overall.get(name)
-        if error is not None and error.episodes:
-            return f"{text}, mean {title} {error.mean:.2g} mm"
+    name, title = main_error(setting.overall) or ("", "")
+    error = setting.overall.get(name + MEAN_MM)
+    if error is not None and error.episodes:
+        return f"{text}, mean {title} {error.mean:.2g} mm"
     return text
 
 

@@ -8,7 +8,7 @@ supplements a task that was built. `BEAMLESS` serves every task without a beam;
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -19,8 +19,30 @@ from surgisoft.errors import InputError
 from surgisoft.tasks.base import Task, TaskState
 from surgisoft.tasks.inverse_kinematics import Pointing
 
+MEAN_MM = "_mean_mm"
+"""End of the name of an episode's mean error."""
 Row = dict[str, Any]
 """One episode's results: name -> number or text; None where a number does not apply."""
+
+
+MAIN_ERRORS = {
+    "tissue_error": "error on the tissue",
+    "beam_error": "beam error",
+    "error": "error",
+}
+"""Errors of which one sentence states the first that a task measures -> their titles. The error on
+the tissue is that of the burn; beside it the beam's is only the distance from where it has to point.
+"""
+
+
+def main_error(names: Iterable[str]) -> tuple[str, str] | None:
+    """(name, title) of the error that sums an episode up, among the names of its numbers.
+
+    The name is without `_mean_mm`. Of a task that measures none of `MAIN_ERRORS` the first one.
+    """
+    found = [n.removesuffix(MEAN_MM) for n in names if n.endswith(f"error{MEAN_MM}")]
+    name = next((known for known in MAIN_ERRORS if known in found), next(iter(found), None))
+    return None if name is None else (name, MAIN_ERRORS.get(name, name.replace("_", " ")))
 
 
 @dataclass(frozen=True)

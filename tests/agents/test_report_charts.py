@@ -69,6 +69,15 @@ def test_an_error_without_bound_leaves_a_gap(monkeypatch):
     assert axis.get_ylim()[0] == pytest.approx(-2.2)
 
 
+def test_on_an_organ_that_moves_the_error_is_that_on_the_tissue(monkeypatch):
+    measures = {"beam_error_mm": np.array([0.1, 0.1]), "tissue_error_mm": np.array([0.4, 0.75])}
+    log = SimpleNamespace(measures=measures, time_s=np.arange(2.0), beams={"laser": None})
+    axis, caption = drawn(monkeypatch, lambda: error_chart(log))
+    np.testing.assert_array_equal(axis.lines[0].get_ydata(), [0.4, 0.75])
+    assert axis.get_title() == "error on the tissue while the beam is on"
+    assert caption == "Largest 0.75 mm"
+
+
 def test_shares_are_drawn_from_0_to_1(monkeypatch):
     groups = [("a", [1.0, 1.0]), ("b", [1.0])]
     share, _ = drawn(monkeypatch, lambda: spread_chart("share cut", groups, "share cut"))

@@ -22,7 +22,7 @@ from surgisoft.cli import run
 from surgisoft.errors import InputError
 from surgisoft.experiments import run as experiment_run
 from surgisoft.experiments import spec as experiment_spec
-from surgisoft.experiments.page import rules
+from surgisoft.experiments.page import rules, verdict
 from surgisoft.experiments.plan import build_task, settings
 from surgisoft.experiments.results import drop_logs, sum_up
 from surgisoft.experiments.run import open_results, run_experiment
@@ -32,7 +32,7 @@ from surgisoft.report import Picture
 from surgisoft.scene.spec import PHANTOM
 from surgisoft.tasks.circle_ablation import CircleAblationConfig, success_rule
 from surgisoft.tasks.registry import spec_of
-from tests.experiments.tiny import TINY, write
+from tests.experiments.tiny import BREATHING, TINY, write
 from tests.report.browser import chromium, look
 
 PLAYED: dict = {}
@@ -456,6 +456,22 @@ def test_a_fault_that_never_came_is_said_to_have_not(tmp_path, capsys):
     file.write_text(file.read_text().replace("on_timeout", 'until = "succeeded"\non_timeout'))
     assert run(["experiment", "check", str(file)]) == 2
     assert "got 'succeeded'; expected one of at rest, never" in capsys.readouterr().err
+
+
+def test_the_verdict_of_a_burn_on_a_moving_organ_is_its_error_on_the_tissue(tmp_path):
+    """A gated beam that points exactly may burn beside its place: that error, and its worst."""
+    spec = load_experiment(write(tmp_path, BREATHING))
+    same = {"setting": "gated", "case": "gated", "outcome": "done", "success": 1.0}
+    same |= {"completion": 1.0, "time_s": 9.0, "beam_unsafe_longest_s": 0.0}
+    beam, tissue = (0.004, 0.002), (0.1, 0.3)
+    rows = [
+        {**same, "episode": k, "beam_error_mean_mm": beam[k], "tissue_error_mean_mm": tissue[k]}
+        for k in range(2)
+    ]
+    results = sum_up(spec, tmp_path, rows)
+    said = "'gated': success 2 of 2, mean error on the tissue 0.2 mm."
+    assert verdict(results).startswith(said)
+    assert results.worst == ("gated", 1)
 
 
 def test_the_rule_of_success_has_the_values_of_all_settings(tmp_path):

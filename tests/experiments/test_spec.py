@@ -14,7 +14,7 @@ from surgisoft.experiments.plan import configured, rig_config, settings
 from surgisoft.experiments.session import ExperimentRules, find_experiment, with_rigs
 from surgisoft.experiments.spec import load_experiment, save_experiment
 from surgisoft.scene.spec import PHANTOM
-from tests.experiments.tiny import FAULT, TINY, write
+from tests.experiments.tiny import BREATHING, FAULT, TINY, write
 
 SHIPPED = sorted((PHANTOM / "experiments").glob("*.toml"))
 
@@ -101,19 +101,6 @@ def test_what_varies_makes_a_grid(tmp_path):
     assert [setting.number for setting in found] == list(range(6))
     assert found[4].label == "simulation_fire_mm=1_chamber=2"
     assert dict(found[4].values) == {"task.fire_mm": 1, "fault.chamber": 2}
-
-
-BREATHING = """
-name = "breaths"
-scenario = "breathing_ablation"
-scene = "{scene}"
-
-[[phases]]
-name = "cut"
-laser = "policy"
-beam = true
-timeout_s = 30.0
-"""
 
 
 def test_a_field_of_several_numbers_varies_over_lists(tmp_path):

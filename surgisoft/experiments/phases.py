@@ -71,6 +71,7 @@ class PhasedTask:
                 "s; expected a shorter time_s or a longer dt_s of the task"
             )
         self.clear_mm = max(limits.clearance_mm, supervision.clearance_limit_mm)
+        """Clearance below which the beam is off: the file's, but not below the scene's (mm)."""
         self.lost_steps = round(limits.view_lost_s / dt_s)
         self.phases, self.conditions = spec.phases, spec.of.experiment.conditions
         names = [phase.name for phase in spec.phases]

@@ -31,7 +31,7 @@ MAIN_ERRORS = {
     "error": "error",
 }
 """Errors of which one sentence states the first that a task measures -> their titles. The error on
-the tissue is that of the burn; beside it the beam's is only the distance from where it has to point.
+the tissue is that of the burn; beside it the beam's is only that of where it has to point.
 """
 
 

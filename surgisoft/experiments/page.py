@@ -14,7 +14,7 @@ from surgisoft.experiments.plan import configured
 from surgisoft.experiments.results import Results, SettingResult
 from surgisoft.experiments.spec import Experiment
 from surgisoft.report import Facts, Gallery, Page, Picture, Section, Share, Table, Text
-from surgisoft.tasks.supervision import MEAN_MM, Row, main_error
+from surgisoft.tasks.supervision import MEAN_MM, Row, ended_well, main_error
 
 SHOWN = 4
 """Most settings of which the first episode is shown."""
@@ -86,14 +86,17 @@ def verdict(results: Results) -> str:
         ended = sum(row["outcome"].startswith("aborted") for row in results.rows)
         first = f"After the fault {ended} of {len(results.rows)} episodes were aborted"
         if _beams(results):
+            cut = sum(row.get("success", 0.0) for row in results.rows)
+            nevertheless = f", {cut:.0f} were cut nevertheless" * _rated(results)
             first += (
-                f", {sum(row['success'] for row in results.rows):.0f} were cut nevertheless; "
-                f"the beam was on for at most {unsafe:.2g} s while it was unsafe"
+                f"{nevertheless}; the beam was on for at most {unsafe:.2g} s while it was unsafe"
             )
         elif len(settings) <= SHOWN:
             first += f"; {each}"
     elif len(settings) <= SHOWN:
         first = each
+    elif not _rated(results):
+        first = _range_of_errors(settings)
     else:
         shares = [s.overall["success"].mean for s in settings]
         low, high = min(shares), max(shares)
@@ -128,9 +131,18 @@ def _beams(results: Results) -> bool:
     return any(phase.beam for phase in results.experiment.phases)
 
 
+def _rated(results: Results) -> bool:
+    """Whether the task has a measure of success."""
+    return all("success" in setting.overall for setting in results.settings)
+
+
 def _one(setting: SettingResult) -> str:
-    success = setting.overall["success"]
-    text = f"success {round(success.mean * success.episodes)} of {success.episodes}"
+    """Success of a setting, without such a measure the episodes that went to their end; its mean
+    error."""
+    ended = sum(map(ended_well, setting.rows))
+    text = f"{ended} of {len(setting.rows)} episodes went to their end"
+    if (success := setting.overall.get("success")) is not None:
+        text = f"success {round(success.mean * success.episodes)} of {success.episodes}"
     name, title = main_error(setting.overall) or ("", "")
     error = setting.overall.get(name + MEAN_MM)
     if error is not None and error.episodes:
@@ -138,21 +150,40 @@ def _one(setting: SettingResult) -> str:
     return text
 
 
+def _range_of_errors(settings: Sequence[SettingResult]) -> str:
+    """Least and largest mean error of many settings of a task without a measure of success."""
+    name, title = main_error(settings[0].overall) or ("", "")
+    known = [s for s in settings if (e := s.overall.get(name + MEAN_MM)) and e.episodes]
+    rows = [row for setting in settings for row in setting.rows]
+    ended = f"{sum(map(ended_well, rows))} of {len(rows)} episodes went to their end"
+    if not known:
+        return ended
+    rising = sorted(known, key=lambda setting: setting.overall[name + MEAN_MM].mean)
+    low, high = (
+        f"{each.overall[name + MEAN_MM].mean:.2g} mm ('{each.label}')"
+        for each in (rising[0], rising[-1])
+    )
+    return f"{ended}, mean {title} from {low} to {high}"
+
+
 def _tone(results: Results) -> str:
     if results.failed or any(row.get("collided", 0.0) > 0.0 for row in results.rows):
         return "bad"
     if results.experiment.faults:
         return "good" if max(row["beam_unsafe_longest_s"] for row in results.rows) < 0.15 else "bad"
+    if not _rated(results):
+        return "plain" if all(map(ended_well, results.rows)) else "warn"
     shares = [setting.overall["success"].mean for setting in results.settings]
     return "good" if min(shares) >= 0.95 else "warn"
 
 
 def _facts(results: Results) -> list[tuple[str, str]]:
     spec, rows = results.experiment, results.rows
+    successes = sum(row.get("success", 0.0) for row in rows)
     return [
         ("episodes", f"{len(rows)}"),
         ("settings", f"{len(results.settings)}"),
-        ("success", f"{sum(row['success'] for row in rows):.0f} of {len(rows)}"),
+        *([("success", f"{successes:.0f} of {len(rows)}")] if _rated(results) else []),
         *_safety(rows),
         ("seed", f"{spec.seed}"),
     ]
@@ -211,7 +242,9 @@ def rules(results: Results) -> str:
     """Definition of success in one sentence: the rule of the task, and no abort."""
     spec = results.experiment
     if spec.of.success_rule is None:
-        return "Success: nothing is aborted."
+        if not _rated(results):
+            return f"{spec.scenario} has no measure of success, so no rate of it is stated."
+        return f"Success: by the measure of {spec.scenario}; nothing is aborted."
     return f"Success: {_rule_of_all(spec, spec.of.success_rule)}; nothing is aborted."
 
 

@@ -56,7 +56,7 @@ from surgisoft.surrogate.checkpoint import content_hash
 from surgisoft.surrogate.code import name_code, named_code
 from surgisoft.tasks.episodes.file import save_episode
 from surgisoft.tasks.episodes.log import EpisodeLog
-from surgisoft.tasks.supervision import Row
+from surgisoft.tasks.supervision import DONE, TIME_OUT, Row
 from surgisoft.workers import CLUSTER, check_processes, torch_threads, workers
 
 POLICY = "policy"
@@ -441,8 +441,7 @@ def _is_whole(row: Row) -> bool:
     rates = [row.get(name, 0) for name in RATES]
     texts = [row.get(name) for name in ("case", "outcome")]
     return (
-        "success" in row
-        and object not in _kinds(row).values()
+        object not in _kinds(row).values()
         and all(type(rate) in (int, float) and rate in (0, 1) for rate in rates)
         and all(isinstance(text, str) for text in texts)
     )
@@ -632,7 +631,7 @@ def _outcomes(task: PhasedTask, result: Rollout, checks: list[EpisodeCheck] | No
         elif reason[i]:
             found.append(f"aborted in {names[int(where[i])]}: {REASONS[int(reason[i])]}")
         else:
-            how = "done" if result.terminated[i] else "time out"
+            how = DONE if result.terminated[i] else TIME_OUT
             after = f"; {names[int(late[i]) - 1]} took too long" if late[i] else ""
             found.append(how + after)
     return found

@@ -21,6 +21,8 @@ from surgisoft.tasks.inverse_kinematics import Pointing
 
 MEAN_MM = "_mean_mm"
 """End of the name of an episode's mean error."""
+DONE, TIME_OUT = "done", "time out"
+"""Begins of the outcomes of episodes that went to their end."""
 Row = dict[str, Any]
 """One episode's results: name -> number or text; None where a number does not apply."""
 
@@ -172,9 +174,16 @@ SUCCEEDED = Condition("the task's measure of success is at least this (0..1)", 1
 
 
 def _unsuccessful(row: Row) -> tuple:
-    """Success first, then the mean error where there is one."""
+    """Success first, or without such a measure the end in time; then the mean error where there is
+    one."""
     errors = [value for name, value in row.items() if name.endswith("error_mean_mm")]
-    return (1.0 - row["success"], *(error or 0.0 for error in errors))
+    well = row["success"] if "success" in row else ended_well(row)
+    return (1.0 - well, *(error or 0.0 for error in errors))
+
+
+def ended_well(row: Row) -> bool:
+    """Whether an episode went to its end: no abort, no contact, all arms finite."""
+    return row["outcome"].startswith((DONE, TIME_OUT))
 
 
 @dataclass(frozen=True)

@@ -458,6 +458,39 @@ def test_a_fault_that_never_came_is_said_to_have_not(tmp_path, capsys):
     assert "got 'succeeded'; expected one of at rest, never" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_a_task_without_a_measure_of_success_has_no_rate_of_it(tmp_path, capsys):
+    """As `evaluate` prints none; what the verdict counts is who went to the end."""
+    file = tmp_path / "path.toml"
+    phase = '[[phases]]\nname = "go"\ntimeout_s = 0.3\non_timeout = "go on"\narm = "policy"\n'
+    file.write_text(f'name = "path"\nscenario = "track_circle"\nrepeats = 2\n{phase}')
+    folder = tmp_path / "r"
+    assert run(["experiment", "run", str(file), "-o", str(folder), "--no-replays"]) == 0
+    rows, printed = _rows(folder), capsys.readouterr().out
+    assert printed.startswith("'simulation': 2 of 2 episodes went to their end.")
+    assert "success" not in rows[0]
+    assert "| success |" not in printed
+    assert "track_circle has no measure of success, so no rate of it is stated." in printed
+    assert 'class="verdict plain"' in (folder / "report.html").read_text()
+    file.write_text(file.read_text().replace("go on", "abort"))
+    assert run(["experiment", "run", str(file), "-o", str(folder), "--no-replays", "--force"]) == 0
+    assert "'simulation': 0 of 2 episodes went to their end" in capsys.readouterr().out
+    spec = load_experiment(file)
+    each = spec_of("track_circle").experiment
+    worst = [each.badness({"outcome": o, "error_mean_mm": e}) for o, e in WORSE]
+    assert worst == sorted(worst)
+    many = [{**row, "setting": f"s{i}"} for i, row in enumerate(rows * 3)]
+    for row, error in zip(many, (0.5, 0.3, 0.9, 0.4, 0.6, 0.7), strict=True):
+        row["error_mean_mm"] = error
+    assert verdict(sum_up(spec, folder, many)) == (
+        "6 of 6 episodes went to their end, mean error from 0.3 mm ('s1') to 0.9 mm ('s2')."
+    )
+
+
+WORSE = (("done", 0.1), ("time out", 0.2), ("aborted in go: phase took too long", 0.0))
+"""Outcomes and errors of episodes without a measure of success, from good to bad."""
+
+
 def test_the_verdict_of_a_burn_on_a_moving_organ_is_its_error_on_the_tissue(tmp_path):
     """A gated beam that points exactly may burn beside its place: that error, and its worst."""
     spec = load_experiment(write(tmp_path, BREATHING))

@@ -26,6 +26,8 @@ from surgisoft.tasks.world.arm import radius_mm
 from surgisoft.tasks.world.respiration import MOVING
 from surgisoft.tasks.world.scene import ObstacleEngine, SceneEngine
 
+DONE = "done"
+"""Event at the end of an episode that went as it should."""
 EARLY = "ended early"
 """Event at the end of an episode that ended before its time without success."""
 JUMP_MM = 3.0
@@ -455,5 +457,5 @@ def _end(log: EpisodeLog, ending: str) -> tuple[str, str]:
         return "error", "an arm is no longer finite"
     success = log.measures.get("success")
     if success is None or success[-1] > 0.0:
-        return "info", "done"
+        return "info", DONE
     return ("warning", "the time has elapsed") if ending == "time out" else ("error", EARLY)

@@ -249,12 +249,15 @@ def rules(results: Results) -> str:
 
 
 def _rule_of_all(spec: Experiment, rule: Callable[[Any], str]) -> str:
-    """The rule of success with the values of all settings, such as "in 30 or 50 s (cut_s)"."""
+    """The rule of success with the values of all settings, such as "in 30 or 50 s (cut_s)".
+
+    Fields that change more than single words of it are named behind it.
+    """
     words = rule(spec.task).split(" ")
     unplaced = []
     for vary in spec.vary:
-        field = vary.field.removeprefix("task.")
-        if not any(f"({field})" in word for word in words):
+        top, _, field = vary.field.partition(".")
+        if top != "task":
             continue
         of_values = [rule(configured(spec, ((vary.field, v),))).split(" ") for v in vary.values]
         if any(len(each) != len(words) for each in of_values):

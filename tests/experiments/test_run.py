@@ -522,3 +522,8 @@ def test_the_rule_of_success_has_the_values_of_all_settings(tmp_path):
     assert "around in 10 to 50 s (cut_s)" in said(TINY + many)
     other = vary.replace("task.fire_mm", "task.world.randomisation.mount_mm")
     assert said(TINY + other) == said(TINY), "not in the rule"
+    area = 'scenario = "area_ablation"\n' + TINY.replace('"cut"\ntimeout', '"treated"\ntimeout')
+    margins = vary.replace("task.fire_mm", "task.spared_mm").replace("0.5, 5.0", "0.5, 2.0")
+    assert "healthy tissue more than 0.5 or 2 mm outside are ablated" in said(area + margins)
+    modes = '\n[[vary]]\nfield = "task.mode"\nvalues = ["follow", "gated"]\n'
+    assert said(BREATHING + modes).endswith("(mode: the setting's value); nothing is aborted.")

@@ -330,7 +330,13 @@ def _lines(results: Results, field: str, name: str) -> dict[str, list[tuple]]:
     """Case and the other values -> (value, mean, low, high) of a number, rising."""
     lines: dict[str, list[tuple]] = {}
     for setting in results.settings:
-        others = [f"{k.split('.')[-1]} {v}" for k, v in setting.values.items() if k != field]
+        if setting.values[field] is None:
+            continue
+        others = [
+            f"{k.split('.')[-1]} {v}"
+            for k, v in setting.values.items()
+            if k != field and v is not None
+        ]
         found = setting.overall[name]
         point = (setting.values[field], found.mean, found.low, found.high)
         lines.setdefault(", ".join([setting.case, *others]), []).append(point)

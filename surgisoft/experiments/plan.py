@@ -91,7 +91,11 @@ def _short(value: Value) -> str:
 
 
 def settings(spec: Experiment, where: Where | None = None) -> list[Setting]:
-    """Every setting in order; a value that does not fit is one line."""
+    """Every setting in order; a value that does not fit is one line.
+
+    What varies on a rig only has no values in a case in simulation, so that each of its settings is
+    there once.
+    """
     place = where or Where(Path(spec.name))
     seen: set[str] = set()
     for i, vary in enumerate(spec.vary):
@@ -106,8 +110,12 @@ def settings(spec: Experiment, where: Where | None = None) -> list[Setting]:
     count *= math.prod(len(vary.values) for vary in spec.vary)
     if count > MOST_SETTINGS:
         raise (place / "vary").error(f"{count} settings", f"at most {MOST_SETTINGS}")
-    grid = [[(vary.field, value) for value in vary.values] for vary in spec.vary]
-    every = itertools.product(spec.cases, spec.lesions or (None,), itertools.product(*grid))
+    lesions = spec.lesions or (None,)
+    every = [
+        parts
+        for case in spec.cases
+        for parts in itertools.product((case,), lesions, itertools.product(*_grid(spec, case)))
+    ]
     found = [Setting(number, *parts) for number, parts in enumerate(every)]
     for setting in found:
         rig_config(setting, place, spec.of.agents)
@@ -121,6 +129,20 @@ def settings(spec: Experiment, where: Where | None = None) -> list[Setting]:
     if twice := [label for label, number in Counter(labels).items() if number > 1]:
         raise (place / "vary").error(f"'{min(twice)}' appears twice", "values that differ")
     return found
+
+
+def _grid(spec: Experiment, case: Case) -> list[list[tuple[str, Value]]]:
+    """(field, value) of all values of each field that varies in a case."""
+    return [
+        [(vary.field, value) for value in vary.values]
+        for vary in spec.vary
+        if case.plant == "rig" or not _on_rig_only(vary.field)
+    ]
+
+
+def _on_rig_only(field: str) -> bool:
+    """Whether a field that varies is one of rigs: a hidden effect, or the robot's seed."""
+    return field.startswith(("hidden.", "rig."))
 
 
 def _check_vary(spec: Experiment, vary: Vary, place: Where) -> None:
@@ -159,7 +181,7 @@ def _check_vary(spec: Experiment, vary: Vary, place: Where) -> None:
             f"got '{vary.field}'",
             "task.NAME, hidden.EFFECT, rig.robot_seed, or (with faults) fault.chamber, fault.at_s",
         )
-    if top in ("hidden", "rig") and not any(case.plant == "rig" for case in spec.cases):
+    if _on_rig_only(vary.field) and not any(case.plant == "rig" for case in spec.cases):
         raise (place / "field").error(
             f"got '{vary.field}', which varies on a rig only", "a case with plant = 'rig'"
         )

@@ -318,8 +318,6 @@ def _as_built(spec: Experiment, setting: Setting) -> Setting:
         case = Case("", policy=case.policy, arm=case.arm, scene=case.scene)
     left_out = (*ROBOT_SEED, "fault.at_s")
     values = tuple((field, value) for field, value in setting.values if field not in left_out)
-    if case.plant != "rig":
-        values = tuple((field, v) for field, v in values if not field.startswith("hidden."))
     return replace(setting, number=0, case=case, values=values)
 
 
@@ -582,7 +580,7 @@ def _rows(
     table |= _timings(task, result)
     about: Row = {"setting": setting.label, "case": setting.case.name}
     about |= {"lesion": setting.lesion.name} if setting.lesion else {}
-    about |= setting.columns
+    about |= {vary.field: None for vary in task.experiment.vary} | setting.columns
     outcomes = _outcomes(task, result, checks)
     return [
         about

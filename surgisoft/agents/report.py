@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from surgisoft.agents.evaluate import RATES, Evaluation, cell
+from surgisoft.agents.evaluate import RATES, WHAT_CELLS_ARE, Evaluation, cell, cells_are
 from surgisoft.agents.report_charts import episode_charts, spread_chart
 from surgisoft.errors import counted
 from surgisoft.report import Facts, Gallery, Page, Picture, Section, Table, Text
@@ -22,9 +22,8 @@ WORDS = {
 """Numbers that are drawn for every episode, in words."""
 UNITS = {"_mm": "mm", "_mm2": "mm²", "_s": "s"}
 """Unit of a number by the end of its name."""
-HOW = (
-    "Means are over episodes, with 95 % intervals in brackets: Wilson's for rates, Student's "
-    "for all else. The beam's error is the distance of its axis from its target while it is on. "
+HOW = WHAT_CELLS_ARE + (
+    "The beam's error is the distance of its axis from its target while it is on. "
     "Clearance, contact and success come from exact collision checks (FCL) where there is a scene."
 )
 
@@ -48,7 +47,10 @@ def evaluation_page(
         (in_words(name), *(cell(name, result.overall.get(name)) for result in results))
         for name in names
     ]
-    header = ["mean [95 % interval]", *(Path(result.policy).name for result in results)]
+    header = [
+        cells_are(result.overall for result in results),
+        *(Path(result.policy).name for result in results),
+    ]
     best = next(iter(results))
     several = len(results) > 1 or any(len(rows) > 1 for rows in best.per_episode.values())
     return Page(

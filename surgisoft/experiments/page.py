@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from surgisoft.agents.evaluate import cell
+from surgisoft.agents.evaluate import WHAT_CELLS_ARE, cell, cells_are
 from surgisoft.agents.report import episode_parts
 from surgisoft.agents.report_charts import path_chart, spread_chart, sweep_chart
 from surgisoft.errors import counted
@@ -18,10 +18,8 @@ from surgisoft.tasks.supervision import MEAN_MM, Row, ended_well, main_error
 
 SHOWN = 4
 """Most settings of which the first episode is shown."""
-HOW = (
-    "Means are over episodes, with 95 % intervals in brackets: Wilson's for rates, Student's "
-    "for all else. Clearance, contact and success come from exact collision checks (FCL) of the "
-    "true bodies."
+HOW = WHAT_CELLS_ARE + (
+    "Clearance, contact and success come from exact collision checks (FCL) of the true bodies."
 )
 
 
@@ -223,11 +221,13 @@ def _table(results: Results) -> Section:
 
 def turned_table(results: Results) -> tuple[list[str], list[tuple[str, ...]]]:
     """Header and rows of the main table, a column for each setting."""
+    known = _known(results)
     rows = [
         (title, *(cell(name, s.overall[name]) for s in results.settings))
-        for name, title in _known(results).items()
+        for name, title in known.items()
     ]
-    return ["mean [95 % interval]", *(setting.label for setting in results.settings)], rows
+    shown = [{name: s.overall[name] for name in known} for s in results.settings]
+    return [cells_are(shown), *(setting.label for setting in results.settings)], rows
 
 
 def markdown(results: Results) -> str:

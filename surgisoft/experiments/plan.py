@@ -205,7 +205,7 @@ def configured(spec: Experiment, values) -> Any:
 
 def rig_config(setting: Setting, place: Where, arms: Sequence[str]) -> RigConfig | None:
     """The rig of a setting for these arms; None in simulation."""
-    varied = dict(setting.values)
+    varied: dict[str, Any] = dict(setting.values)
     if setting.case.plant != "rig":
         return None
     hidden: dict[str, float] = {}

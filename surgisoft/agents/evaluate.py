@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -21,6 +21,14 @@ from surgisoft.tasks.world.scene import SceneEngine
 
 CONFIDENCE = 0.95
 """Confidence level of the intervals."""
+FEW = 5
+"""Tables have intervals of means from so many episodes on (a count)."""
+WHAT_CELLS_ARE = (
+    "Means are over episodes, with 95 % intervals in square brackets: Wilson's for rates, "
+    f"Student's for all else. Of fewer than {FEW} episodes the least and the greatest number are "
+    "in round brackets, in place of Student's interval. "
+)
+"""How to read a table of means, for reports."""
 
 SUMMARIES: dict[str, Callable[[Rollout, str], Tensor]] = {
     "completion": Rollout.end,
@@ -247,14 +255,31 @@ def student(values: np.ndarray) -> tuple[float, float]:
     return mean - half, mean + half
 
 
+def cells_are(summaries: Iterable[Mapping[str, Summary]]) -> str:
+    """What `cell` writes of these numbers of the policies or settings, for the head of a table."""
+    few = any(_is_few(n, value) for overall in summaries for n, value in overall.items())
+    return "mean [95 % interval]" + " or (least to greatest)" * few
+
+
+def _is_few(name: str, value: Summary) -> bool:
+    """Whether a number that differs is of so few episodes that its interval says nothing of it."""
+    return name not in RATES and 1 < value.episodes < FEW and value.least < value.most
+
+
 def cell(name: str, value: Summary | None) -> str:
-    """A mean with its interval in brackets; without one where all episodes have the same number."""
+    """A mean with its interval in brackets; without one where all episodes have the same number.
+
+    Of fewer than `FEW` episodes least and greatest number: Student's interval of two is 25 times as
+    wide as what lies between them, which looks like contact where a clearance is ample.
+    """
     if value is None or not value.episodes:
         return "-"
     if name in RATES:
         return f"{value.mean:.1%} [{value.low:.1%}, {value.high:.1%}]"
     if value.least == value.most:
         return f"{value.mean:.4g}"
+    if _is_few(name, value):
+        return f"{value.mean:.4g} ({value.least:.4g} to {value.most:.4g})"
     return f"{value.mean:.4g} [{value.low:.4g}, {value.high:.4g}]"
 
 

@@ -5,24 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from surgisoft.agents.evaluate import RATES, Evaluation, Summary, cell
+from surgisoft.agents.evaluate import RATES, WHAT_CELLS_ARE, Evaluation, cell, cells_are
 from surgisoft.agents.report_charts import episode_charts, spread_chart
 from surgisoft.errors import counted
 from surgisoft.report import Facts, Gallery, Page, Picture, Section, Table, Text
 from surgisoft.tasks.episodes.log import EpisodeLog
+from surgisoft.tasks.supervision import MEAN_MM, main_error
 
 WORDS = {
     "success": "success",
     "completion": "share done",
     "beam_error_mean_mm": "mean beam error [mm]",
+    "tissue_error_mean_mm": "mean error on the tissue [mm]",
     "clearance_mm": "least clearance [mm]",
 }
 """Numbers that are drawn for every episode, in words."""
 UNITS = {"_mm": "mm", "_mm2": "mm²", "_s": "s"}
 """Unit of a number by the end of its name."""
-HOW = (
-    "Means are over episodes, with 95 % intervals in brackets: Wilson's for rates, Student's "
-    "for all else. The beam's error is the distance of its axis from its target while it is on. "
+HOW = WHAT_CELLS_ARE + (
+    "The beam's error is the distance of its axis from its target while it is on. "
     "Clearance, contact and success come from exact collision checks (FCL) where there is a scene."
 )
 
@@ -46,7 +47,10 @@ def evaluation_page(
         (in_words(name), *(cell(name, result.overall.get(name)) for result in results))
         for name in names
     ]
-    header = ["mean [95 % interval]", *(Path(result.policy).name for result in results)]
+    header = [
+        cells_are(result.overall for result in results),
+        *(Path(result.policy).name for result in results),
+    ]
     best = next(iter(results))
     several = len(results) > 1 or any(len(rows) > 1 for rows in best.per_episode.values())
     return Page(
@@ -108,10 +112,9 @@ def verdict(task: str, results: Sequence[Evaluation]) -> str:
     """One sentence with each policy's success and error."""
     parts = []
     for result in results:
-        success, error = result.overall.get("success"), _error(result)
+        success = result.overall.get("success")
         words = [] if success is None else [f"{success.mean:.0%} success"]
-        if error is not None and error.episodes:
-            words.append(f"mean error {error.mean:.3g} mm")
+        words += [" ".join(stated) for stated in _error(result)]
         parts.append(f"{Path(result.policy).name}: {', '.join(words) or 'see the table'}")
     counts = [result.episodes for result in results]
     episodes = f"{counted(counts[0], 'episode')} each"
@@ -120,9 +123,11 @@ def verdict(task: str, results: Sequence[Evaluation]) -> str:
     return f"Task {task}, {episodes}. {'; '.join(parts)}."
 
 
-def _error(result: Evaluation) -> Summary | None:
-    names = [name for name in result.overall if name.endswith("error_mean_mm")]
-    return result.overall[names[0]] if names else None
+def _error(result: Evaluation) -> list[tuple[str, str]]:
+    """Title and text of the mean error that sums the episodes up, where one applies."""
+    name, title = main_error(result.overall) or ("", "")
+    error = result.overall.get(name + MEAN_MM)
+    return [(f"mean {title}", f"{error.mean:.3g} mm")] if error and error.episodes else []
 
 
 def _tone(results: Sequence[Evaluation]) -> str:
@@ -139,10 +144,7 @@ def _facts(result: Evaluation) -> list[tuple[str, str]]:
         if value is not None and value.episodes:
             text = f"{value.mean:.0%}" if name in (*RATES, "completion") else f"{value.mean:.3g}"
             items.append((in_words(name), text))
-    error = _error(result)
-    if error is not None and error.episodes:
-        items.append(("mean error", f"{error.mean:.3g} mm"))
-    return items
+    return [*items, *_error(result)]
 
 
 def _spreads(results: Sequence[Evaluation]) -> list[Picture]:

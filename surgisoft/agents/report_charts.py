@@ -25,6 +25,10 @@ MOST_TICKS = 6
 """Most intervals between the ticks of an axis whose labels stand side by side."""
 PLAIN_POWERS = (-3, 4)
 """Powers of ten whose numbers are written out at an axis; others have a common factor."""
+RESTING_MM = 0.05
+"""A reference that moves less than this between two jumps rests: it is drawn as a point (mm)."""
+RESTING_POINTS = 7.0
+"""Diameter of that point (points of the page)."""
 LEAST_DOSE = 0.1
 """Doses below this share of the threshold are left blank."""
 
@@ -58,12 +62,16 @@ def path_chart(log: EpisodeLog, title: str = "path over target") -> Picture:
         for number, path in enumerate(flat):
             label = "reference" if number == 0 else None
             axis.plot(*broken_at_jumps(path).T, c=AMBER, lw=wide, alpha=0.55, label=label)
+            rests = np.zeros((0, 2)) if len(log.path_mm) else resting_places(path)
+            if len(rests):
+                axis.plot(*rests.T, c=AMBER, marker="o", ms=RESTING_POINTS, mew=0.0, ls="none")
         for number, (end, on) in enumerate(done):
             went = (end - middle) @ plane
             went = np.where((on & np.isfinite(went).all(1))[:, None], went, np.nan)
             word = [*log.beams][number] if len(done) > 1 else "burnt" if log.beams else "done"
             colour = (BLUE, GREEN)[number % 2]
-            axis.plot(*broken_at_jumps(went).T, c=colour, lw=1.3, label=word)
+            line = broken_at_jumps(went) if log.beams else went  # an arm passes what lies between
+            axis.plot(*line.T, c=colour, lw=1.3, label=word)
         axis.set_aspect("equal", adjustable="datalim")
         axis.set_xlabel("mm")
         axis.set_ylabel("mm")
@@ -73,10 +81,13 @@ def path_chart(log: EpisodeLog, title: str = "path over target") -> Picture:
 
 
 def error_chart(log: EpisodeLog) -> Picture | None:
-    """The distance from the reference over time; with a beam, only while it is on."""
-    named = log.measures.get("beam_error_mm")
-    error = log.error_mm if named is None else named
-    error = _drawable(error)
+    """The distance from the reference over time; with a beam, only while it is on.
+
+    On an organ that moves it is the distance on the tissue.
+    """
+    tissue = log.measures.get("tissue_error_mm")
+    named = log.measures.get("beam_error_mm") if tissue is None else tissue
+    error = _drawable(log.error_mm if named is None else named)
     if np.isnan(error).all():
         return None
     largest = float(np.nanmax(error))
@@ -87,7 +98,8 @@ def error_chart(log: EpisodeLog) -> Picture | None:
         axis.set_xlim(0.0, log.time_s[-1])
         axis.set_xlabel("time [s]")
         axis.set_ylabel("error [mm]")
-        axis.set_title("error over time" + (" while the beam is on" if log.beams else ""))
+        title = "error over time" if tissue is None else "error on the tissue"
+        axis.set_title(title + (" while the beam is on" if log.beams else ""))
         return chart(figure, "error over time", f"Largest {largest:.3g} mm")
 
 
@@ -281,6 +293,15 @@ def broken_at_jumps(points: np.ndarray) -> np.ndarray:
     """(N, 2) mm with a gap wherever the next point is far."""
     jump = np.linalg.norm(np.diff(points, axis=0), axis=1) > JUMP_MM
     return np.insert(points, np.flatnonzero(jump) + 1, np.nan, axis=0)
+
+
+def resting_places(points: np.ndarray) -> np.ndarray:
+    """(K, 2) mm: places at which (N, 2) points stay between jumps, such as targets in turn."""
+    known = points[np.isfinite(points).all(1)]
+    jumps = np.flatnonzero(np.linalg.norm(np.diff(known, axis=0), axis=1) > JUMP_MM) + 1
+    pieces = [piece for piece in np.split(known, jumps) if len(piece)]
+    rests = [piece[0] for piece in pieces if np.ptp(piece, axis=0).max() < RESTING_MM]
+    return np.array(rests).reshape(-1, 2)
 
 
 UNORDERED = ("chamber", "robot_seed", "specimen")

@@ -118,6 +118,7 @@ def evaluate(
     on = on or (PLACES[1] if rig else PLACES[0])
     rigs = _rig_config(on, rig, robot_seed, hidden, cameras, observer_gain, preflight)
 
+    from surgisoft.agents.evaluate import cells_are
     from surgisoft.agents.session import evaluate as evaluate_policies
 
     laid: Rules | None = None
@@ -173,7 +174,8 @@ def evaluate(
         given = found.task, on, list(found.results), found.logs, about, films, curves
         page = evaluation_page(*given)
         written.append(write_page(page, report / "report.html"))
-    print(f"{found.task}, {on}: {about}; mean [95 % interval]")
+    heading = cells_are(result.overall for result in found.results)
+    print(f"{found.task}, {on}: {about}; {heading}")
     _show(found.results)
     if found.success_rule:
         print(f"success: {found.success_rule}")

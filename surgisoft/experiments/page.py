@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from surgisoft.agents.evaluate import cell
+from surgisoft.agents.evaluate import WHAT_CELLS_ARE, cell, cells_are
 from surgisoft.agents.report import episode_parts
 from surgisoft.agents.report_charts import path_chart, spread_chart, sweep_chart
 from surgisoft.errors import counted
@@ -14,14 +14,12 @@ from surgisoft.experiments.plan import configured
 from surgisoft.experiments.results import Results, SettingResult
 from surgisoft.experiments.spec import Experiment
 from surgisoft.report import Facts, Gallery, Page, Picture, Section, Share, Table, Text
-from surgisoft.tasks.supervision import Row
+from surgisoft.tasks.supervision import MEAN_MM, Row, ended_well, main_error
 
 SHOWN = 4
 """Most settings of which the first episode is shown."""
-HOW = (
-    "Means are over episodes, with 95 % intervals in brackets: Wilson's for rates, Student's "
-    "for all else. Clearance, contact and success come from exact collision checks (FCL) of the "
-    "true bodies."
+HOW = WHAT_CELLS_ARE + (
+    "Clearance, contact and success come from exact collision checks (FCL) of the true bodies."
 )
 
 
@@ -86,14 +84,17 @@ def verdict(results: Results) -> str:
         ended = sum(row["outcome"].startswith("aborted") for row in results.rows)
         first = f"After the fault {ended} of {len(results.rows)} episodes were aborted"
         if _beams(results):
+            cut = sum(row.get("success", 0.0) for row in results.rows)
+            nevertheless = f", {cut:.0f} were cut nevertheless" * _rated(results)
             first += (
-                f", {sum(row['success'] for row in results.rows):.0f} were cut nevertheless; "
-                f"the beam was on for at most {unsafe:.2g} s while it was unsafe"
+                f"{nevertheless}; the beam was on for at most {unsafe:.2g} s while it was unsafe"
             )
         elif len(settings) <= SHOWN:
             first += f"; {each}"
     elif len(settings) <= SHOWN:
         first = each
+    elif not _rated(results):
+        first = _range_of_errors(settings)
     else:
         shares = [s.overall["success"].mean for s in settings]
         low, high = min(shares), max(shares)
@@ -128,14 +129,39 @@ def _beams(results: Results) -> bool:
     return any(phase.beam for phase in results.experiment.phases)
 
 
+def _rated(results: Results) -> bool:
+    """Whether the task has a measure of success."""
+    return all("success" in setting.overall for setting in results.settings)
+
+
 def _one(setting: SettingResult) -> str:
-    success = setting.overall["success"]
-    text = f"success {round(success.mean * success.episodes)} of {success.episodes}"
-    for name, title in (("beam_error_mean_mm", "beam error"), ("error_mean_mm", "error")):
-        error = setting.overall.get(name)
-        if error is not None and error.episodes:
-            return f"{text}, mean {title} {error.mean:.2g} mm"
+    """Success of a setting, without such a measure the episodes that went to their end; its mean
+    error."""
+    ended = sum(map(ended_well, setting.rows))
+    text = f"{ended} of {len(setting.rows)} episodes went to their end"
+    if (success := setting.overall.get("success")) is not None:
+        text = f"success {round(success.mean * success.episodes)} of {success.episodes}"
+    name, title = main_error(setting.overall) or ("", "")
+    error = setting.overall.get(name + MEAN_MM)
+    if error is not None and error.episodes:
+        return f"{text}, mean {title} {error.mean:.2g} mm"
     return text
+
+
+def _range_of_errors(settings: Sequence[SettingResult]) -> str:
+    """Least and largest mean error of many settings of a task without a measure of success."""
+    name, title = main_error(settings[0].overall) or ("", "")
+    known = [s for s in settings if (e := s.overall.get(name + MEAN_MM)) and e.episodes]
+    rows = [row for setting in settings for row in setting.rows]
+    ended = f"{sum(map(ended_well, rows))} of {len(rows)} episodes went to their end"
+    if not known:
+        return ended
+    rising = sorted(known, key=lambda setting: setting.overall[name + MEAN_MM].mean)
+    low, high = (
+        f"{each.overall[name + MEAN_MM].mean:.2g} mm ('{each.label}')"
+        for each in (rising[0], rising[-1])
+    )
+    return f"{ended}, mean {title} from {low} to {high}"
 
 
 def _tone(results: Results) -> str:
@@ -143,16 +169,19 @@ def _tone(results: Results) -> str:
         return "bad"
     if results.experiment.faults:
         return "good" if max(row["beam_unsafe_longest_s"] for row in results.rows) < 0.15 else "bad"
+    if not _rated(results):
+        return "plain" if all(map(ended_well, results.rows)) else "warn"
     shares = [setting.overall["success"].mean for setting in results.settings]
     return "good" if min(shares) >= 0.95 else "warn"
 
 
 def _facts(results: Results) -> list[tuple[str, str]]:
     spec, rows = results.experiment, results.rows
+    successes = sum(row.get("success", 0.0) for row in rows)
     return [
         ("episodes", f"{len(rows)}"),
         ("settings", f"{len(results.settings)}"),
-        ("success", f"{sum(row['success'] for row in rows):.0f} of {len(rows)}"),
+        *([("success", f"{successes:.0f} of {len(rows)}")] if _rated(results) else []),
         *_safety(rows),
         ("seed", f"{spec.seed}"),
     ]
@@ -192,11 +221,13 @@ def _table(results: Results) -> Section:
 
 def turned_table(results: Results) -> tuple[list[str], list[tuple[str, ...]]]:
     """Header and rows of the main table, a column for each setting."""
+    known = _known(results)
     rows = [
         (title, *(cell(name, s.overall[name]) for s in results.settings))
-        for name, title in _known(results).items()
+        for name, title in known.items()
     ]
-    return ["mean [95 % interval]", *(setting.label for setting in results.settings)], rows
+    shown = [{name: s.overall[name] for name in known} for s in results.settings]
+    return [cells_are(shown), *(setting.label for setting in results.settings)], rows
 
 
 def markdown(results: Results) -> str:
@@ -211,17 +242,22 @@ def rules(results: Results) -> str:
     """Definition of success in one sentence: the rule of the task, and no abort."""
     spec = results.experiment
     if spec.of.success_rule is None:
-        return "Success: nothing is aborted."
+        if not _rated(results):
+            return f"{spec.scenario} has no measure of success, so no rate of it is stated."
+        return f"Success: by the measure of {spec.scenario}; nothing is aborted."
     return f"Success: {_rule_of_all(spec, spec.of.success_rule)}; nothing is aborted."
 
 
 def _rule_of_all(spec: Experiment, rule: Callable[[Any], str]) -> str:
-    """The rule of success with the values of all settings, such as "in 30 or 50 s (cut_s)"."""
+    """The rule of success with the values of all settings, such as "in 30 or 50 s (cut_s)".
+
+    Fields that change more than single words of it are named behind it.
+    """
     words = rule(spec.task).split(" ")
     unplaced = []
     for vary in spec.vary:
-        field = vary.field.removeprefix("task.")
-        if not any(f"({field})" in word for word in words):
+        top, _, field = vary.field.partition(".")
+        if top != "task":
             continue
         of_values = [rule(configured(spec, ((vary.field, v),))).split(" ") for v in vary.values]
         if any(len(each) != len(words) for each in of_values):
@@ -279,7 +315,7 @@ def _sweeps(results: Results) -> list[Section]:
     """A section for each number that varies: success and error over it."""
     sections, known = [], _known(results)
     for vary in results.experiment.vary:
-        if any(isinstance(value, str) for value in vary.values) or len(vary.values) < 2:
+        if len(vary.values) < 2 or any(isinstance(each, str | tuple) for each in vary.values):
             continue
         charts = [
             sweep_chart(vary.field, known[name], _lines(results, vary.field, name))
@@ -294,7 +330,13 @@ def _lines(results: Results, field: str, name: str) -> dict[str, list[tuple]]:
     """Case and the other values -> (value, mean, low, high) of a number, rising."""
     lines: dict[str, list[tuple]] = {}
     for setting in results.settings:
-        others = [f"{k.split('.')[-1]} {v}" for k, v in setting.values.items() if k != field]
+        if setting.values[field] is None:
+            continue
+        others = [
+            f"{k.split('.')[-1]} {v}"
+            for k, v in setting.values.items()
+            if k != field and v is not None
+        ]
         found = setting.overall[name]
         point = (setting.values[field], found.mean, found.low, found.high)
         lines.setdefault(", ".join([setting.case, *others]), []).append(point)

@@ -13,7 +13,7 @@ from torch import Tensor
 from surgisoft.errors import InputError
 from surgisoft.experiments.spec import Experiment
 from surgisoft.tasks.base import TaskState
-from surgisoft.tasks.episodes.log import EARLY, EpisodeLog
+from surgisoft.tasks.episodes.log import DONE, EARLY, EpisodeLog
 from surgisoft.tasks.episodes.parts import Event
 from surgisoft.tasks.registry import MOST_STEPS
 from surgisoft.tasks.supervision import Supervision
@@ -71,6 +71,7 @@ class PhasedTask:
                 "s; expected a shorter time_s or a longer dt_s of the task"
             )
         self.clear_mm = max(limits.clearance_mm, supervision.clearance_limit_mm)
+        """Clearance below which the beam is off: the file's, but not below the scene's (mm)."""
         self.lost_steps = round(limits.view_lost_s / dt_s)
         self.phases, self.conditions = spec.phases, spec.of.experiment.conditions
         names = [phase.name for phase in spec.phases]
@@ -187,7 +188,7 @@ class PhasedTask:
         return done | self.supervision.collides(self.plain(state))
 
     def measures(self, state: TaskState) -> dict[str, Tensor]:
-        """The measures of the task beneath; success also requires that nothing was aborted.
+        """The measures of the task beneath; a success also requires that nothing was aborted.
 
         `beam` is 1 where it was on in the step before, `beam_unsafe` where that step ended unsafe.
         """
@@ -198,8 +199,10 @@ class PhasedTask:
             aims = self.beam[goal.phase]
             pointing = values["pointing_error_mm"].where(aims, torch.nan)
             values = values | {"pointing_error_mm": pointing}
+        if "success" in values:
+            whole = (goal.reason == RUNNING).float()
+            values = values | {"success": values["success"] * whole}
         return values | {
-            "success": values.get("success", 1.0) * (goal.reason == RUNNING).float(),
             "phase": goal.phase.float(),
             "reason": goal.reason.float(),
             "reason_phase": goal.where.float(),
@@ -222,7 +225,7 @@ def with_phase_events(spec: Experiment, log: EpisodeLog) -> EpisodeLog:
     """The log of a phased episode with phases, faults and the abort's reason among its events.
 
     A phase whose time was out before its condition held is a warning. Where the phases ended the
-    episode without success, this is said in place of an early end.
+    episode without success, or after an abort, this is said in place of an early end, or of "done".
     """
     phase, reason = (log.measures[name].astype(int) for name in ("phase", "reason"))
     names = [f"phase {phase.name}" for phase in spec.phases] + ["all phases done"]
@@ -243,6 +246,9 @@ def with_phase_events(spec: Experiment, log: EpisodeLog) -> EpisodeLog:
     if phase[-1] == len(spec.phases) and others and others[-1].text == EARLY:
         others = others[:-1]
         found.append(replace(log.events[-1], level="warning", text="ended without success"))
+    elif reason[-1] > RUNNING and others and others[-1].text == DONE:
+        others = others[:-1]
+        found.append(replace(log.events[-1], level="warning", text="ended after the abort"))
     events = sorted((*others, *found), key=lambda event: event.time_s)
     return replace(log, events=tuple(events))
 

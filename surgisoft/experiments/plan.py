@@ -29,7 +29,7 @@ from surgisoft.scene.folder import Scene, open_scene
 from surgisoft.scene.lesion import distance_from_ring_mm
 from surgisoft.tasks.registry import with_fields, with_present_names
 
-Value = int | float | str
+Value = int | float | str | tuple[int | float, ...]
 MOST_SETTINGS = 100_000
 """Most settings of an experiment."""
 LONGEST_LABEL = 200
@@ -64,11 +64,25 @@ class Setting:
     def words(self) -> str:
         """Label of the setting in words."""
         parts = [self.case.name, *([self.lesion.name] if self.lesion else [])]
-        return ", ".join([*parts, *(f"{f.split('.')[-1]} {v}" for f, v in self.values)])
+        return ", ".join([*parts, *(f"{f.split('.')[-1]} {in_words(v)}" for f, v in self.values)])
+
+    @property
+    def columns(self) -> dict[str, int | float | str]:
+        """Varied fields and their values for a row of results; several numbers as one text."""
+        return {f: in_words(v) if isinstance(v, tuple) else v for f, v in self.values}
+
+
+def in_words(value: Value) -> str:
+    """A value as text, several numbers as `[2, 10]`."""
+    if not isinstance(value, tuple):
+        return f"{value}"
+    return f"[{', '.join(f'{number:.15g}' for number in value)}]"
 
 
 def _short(value: Value) -> str:
     """A value in characters of a file's name; a number from `LARGE` on with all of its digits."""
+    if isinstance(value, tuple):
+        return "-".join(map(_short, value))
     if isinstance(value, str):
         text = Path(value).name
     else:
@@ -77,7 +91,11 @@ def _short(value: Value) -> str:
 
 
 def settings(spec: Experiment, where: Where | None = None) -> list[Setting]:
-    """Every setting in order; a value that does not fit is one line."""
+    """Every setting in order; a value that does not fit is one line.
+
+    What varies on a rig only has no values in a case in simulation, so that each of its settings is
+    there once.
+    """
     place = where or Where(Path(spec.name))
     seen: set[str] = set()
     for i, vary in enumerate(spec.vary):
@@ -92,8 +110,12 @@ def settings(spec: Experiment, where: Where | None = None) -> list[Setting]:
     count *= math.prod(len(vary.values) for vary in spec.vary)
     if count > MOST_SETTINGS:
         raise (place / "vary").error(f"{count} settings", f"at most {MOST_SETTINGS}")
-    grid = [[(vary.field, value) for value in vary.values] for vary in spec.vary]
-    every = itertools.product(spec.cases, spec.lesions or (None,), itertools.product(*grid))
+    lesions = spec.lesions or (None,)
+    every = [
+        parts
+        for case in spec.cases
+        for parts in itertools.product((case,), lesions, itertools.product(*_grid(spec, case)))
+    ]
     found = [Setting(number, *parts) for number, parts in enumerate(every)]
     for setting in found:
         rig_config(setting, place, spec.of.agents)
@@ -107,6 +129,20 @@ def settings(spec: Experiment, where: Where | None = None) -> list[Setting]:
     if twice := [label for label, number in Counter(labels).items() if number > 1]:
         raise (place / "vary").error(f"'{min(twice)}' appears twice", "values that differ")
     return found
+
+
+def _grid(spec: Experiment, case: Case) -> list[list[tuple[str, Value]]]:
+    """(field, value) of all values of each field that varies in a case."""
+    return [
+        [(vary.field, value) for value in vary.values]
+        for vary in spec.vary
+        if case.plant == "rig" or not _on_rig_only(vary.field)
+    ]
+
+
+def _on_rig_only(field: str) -> bool:
+    """Whether a field that varies is one of rigs: a hidden effect, or the robot's seed."""
+    return field.startswith(("hidden.", "rig."))
 
 
 def _check_vary(spec: Experiment, vary: Vary, place: Where) -> None:
@@ -128,7 +164,7 @@ def _check_vary(spec: Experiment, vary: Vary, place: Where) -> None:
             raise (place / "field").error(
                 f"unknown effect '{name}'", f"one of {', '.join(sorted(HIDDEN))}"
             )
-        bad = [value for value in vary.values if isinstance(value, str) or value < 0]
+        bad = [v for v in vary.values if not isinstance(v, int | float) or v < 0]
         if bad:
             raise (place / "values").error(f"got {bad[0]!r}", "amplitudes from 0")
     elif top == "fault" and name in ("chamber", "at_s") and spec.faults:
@@ -145,7 +181,7 @@ def _check_vary(spec: Experiment, vary: Vary, place: Where) -> None:
             f"got '{vary.field}'",
             "task.NAME, hidden.EFFECT, rig.robot_seed, or (with faults) fault.chamber, fault.at_s",
         )
-    if top in ("hidden", "rig") and not any(case.plant == "rig" for case in spec.cases):
+    if _on_rig_only(vary.field) and not any(case.plant == "rig" for case in spec.cases):
         raise (place / "field").error(
             f"got '{vary.field}', which varies on a rig only", "a case with plant = 'rig'"
         )
@@ -169,7 +205,7 @@ def configured(spec: Experiment, values) -> Any:
 
 def rig_config(setting: Setting, place: Where, arms: Sequence[str]) -> RigConfig | None:
     """The rig of a setting for these arms; None in simulation."""
-    varied = dict(setting.values)
+    varied: dict[str, Any] = dict(setting.values)
     if setting.case.plant != "rig":
         return None
     hidden: dict[str, float] = {}

@@ -29,8 +29,8 @@ class SettingResult:
     """The setting's label, see `Setting.label`."""
     case: str
     """Name of the case."""
-    values: dict[str, float | int | str]
-    """Varied fields and their values, the lesion among them."""
+    values: dict[str, float | int | str | None]
+    """Varied fields and their values, the lesion among them; None for what varies on a rig only."""
     rows: list[Row]
     """Results of the episodes, in order."""
     overall: dict[str, Summary]

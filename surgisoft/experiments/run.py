@@ -56,7 +56,7 @@ from surgisoft.surrogate.checkpoint import content_hash
 from surgisoft.surrogate.code import name_code, named_code
 from surgisoft.tasks.episodes.file import save_episode
 from surgisoft.tasks.episodes.log import EpisodeLog
-from surgisoft.tasks.supervision import Row
+from surgisoft.tasks.supervision import DONE, TIME_OUT, Row
 from surgisoft.workers import CLUSTER, check_processes, torch_threads, workers
 
 POLICY = "policy"
@@ -318,8 +318,6 @@ def _as_built(spec: Experiment, setting: Setting) -> Setting:
         case = Case("", policy=case.policy, arm=case.arm, scene=case.scene)
     left_out = (*ROBOT_SEED, "fault.at_s")
     values = tuple((field, value) for field, value in setting.values if field not in left_out)
-    if case.plant != "rig":
-        values = tuple((field, v) for field, v in values if not field.startswith("hidden."))
     return replace(setting, number=0, case=case, values=values)
 
 
@@ -441,8 +439,7 @@ def _is_whole(row: Row) -> bool:
     rates = [row.get(name, 0) for name in RATES]
     texts = [row.get(name) for name in ("case", "outcome")]
     return (
-        "success" in row
-        and object not in _kinds(row).values()
+        object not in _kinds(row).values()
         and all(type(rate) in (int, float) and rate in (0, 1) for rate in rates)
         and all(isinstance(text, str) for text in texts)
     )
@@ -583,7 +580,7 @@ def _rows(
     table |= _timings(task, result)
     about: Row = {"setting": setting.label, "case": setting.case.name}
     about |= {"lesion": setting.lesion.name} if setting.lesion else {}
-    about |= dict(setting.values)
+    about |= {vary.field: None for vary in task.experiment.vary} | setting.columns
     outcomes = _outcomes(task, result, checks)
     return [
         about
@@ -632,7 +629,7 @@ def _outcomes(task: PhasedTask, result: Rollout, checks: list[EpisodeCheck] | No
         elif reason[i]:
             found.append(f"aborted in {names[int(where[i])]}: {REASONS[int(reason[i])]}")
         else:
-            how = "done" if result.terminated[i] else "time out"
+            how = DONE if result.terminated[i] else TIME_OUT
             after = f"; {names[int(late[i]) - 1]} took too long" if late[i] else ""
             found.append(how + after)
     return found

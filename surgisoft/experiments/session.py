@@ -19,7 +19,14 @@ from surgisoft.experiments.controllers import PhaseControllers
 from surgisoft.experiments.page import experiment_page, markdown, shown_episodes
 from surgisoft.experiments.phases import PhasedTask
 from surgisoft.experiments.pictures import film, write_pictures
-from surgisoft.experiments.plan import Setting, build_task, scene_folder, scene_of, settings
+from surgisoft.experiments.plan import (
+    Setting,
+    build_task,
+    in_words,
+    scene_folder,
+    scene_of,
+    settings,
+)
 from surgisoft.experiments.results import Results, drop_logs, sum_up, write_tables
 from surgisoft.experiments.run import DROPPED, about_policies, open_results, run_experiment
 from surgisoft.experiments.spec import SCRIPTED, Experiment, load_experiment
@@ -128,7 +135,7 @@ class ExperimentRules:
         for vary in spec.vary:
             plain = self._plain(vary.field)
             here = f", here {plain}" if plain else ""
-            found.append(f"{vary.field} ({', '.join(map(str, vary.values))}{here})")
+            found.append(f"{vary.field} ({', '.join(map(in_words, vary.values))}{here})")
         if spec.lesions:
             found.append(f"the lesions {', '.join(each.name for each in spec.lesions)}")
         scenes = dict.fromkeys(Path(case.scene).name for case in spec.cases if case.scene)
@@ -147,7 +154,7 @@ class ExperimentRules:
         found = self.spec.task
         for name in names:
             found = getattr(found, name, None)
-        return str(found) if top == "task" and found is not None else ""
+        return in_words(found) if top == "task" and found is not None else ""
 
     def over(self, task: Task) -> PhasedTask:
         """The task under the rules."""

@@ -145,9 +145,10 @@ class Vary:
     """`task.NAME` (dots go deeper), `hidden.EFFECT` (amplitude, on the rig),
     `rig.robot_seed`, `fault.chamber` or `fault.at_s`."""
     values: Annotated[
-        tuple[int | float | str, ...], Rule("a list of at least one value", lambda v: len(v) > 0)
+        tuple[int | float | str | tuple[int | float, ...], ...],
+        Rule("a list of at least one value", lambda v: len(v) > 0),
     ]
-    """Values of the field."""
+    """Values of the field; a value of a field of several numbers is a list of them."""
 
 
 @dataclass(frozen=True)

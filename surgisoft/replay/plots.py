@@ -40,6 +40,10 @@ Corner = Literal["lefttop", "leftbottom", "righttop", "rightbottom"]
 """A corner of a plot."""
 
 
+Kept = Literal["Average", "Max", "Min"]
+"""What a plot draws of the rows in one column of pixels: peaks of errors have to stay in sight."""
+
+
 @dataclass(frozen=True, eq=False)
 class Line:
     """One line of a plot."""
@@ -54,6 +58,8 @@ class Line:
     """sRGB, 0..255."""
     width: float = 1.6
     """Width in points."""
+    keeps: Kept = "Average"
+    """What is drawn of rows that share a column of pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +102,8 @@ def plots_of(log: EpisodeLog) -> tuple[Plot, ...]:
     shares = {name: log.measures[name] for name in SHARES if name in log.measures}
     taken = {*errors, *shares, *SHOWN_ELSEWHERE}
     others = {name: values for name, values in log.measures.items() if name not in taken}
-    made = [Plot("Path error (mm)", _lines("error", errors), _corner(errors, "righttop"))]
+    lines = _lines("error", errors, "Max")
+    made = [Plot("Path error (mm)", lines, _corner(errors, "righttop"))]
     for name, arm in log.arms.items():
         made.append(Plot(f"Pressure of {name} (kPa)", _pressures(name, arm), "righttop"))
     if shares:
@@ -118,9 +125,11 @@ def _corner(series: Mapping[str, np.ndarray], corner: Corner) -> Corner | None:
     return corner if len(series) > 1 else None
 
 
-def _lines(group: str, series: Mapping[str, np.ndarray]) -> tuple[Line, ...]:
+def _lines(
+    group: str, series: Mapping[str, np.ndarray], keeps: Kept = "Average"
+) -> tuple[Line, ...]:
     return tuple(
-        Line(f"/plots/{group}/{name}", name, values, series_colour(i))
+        Line(f"/plots/{group}/{name}", name, values, series_colour(i), keeps=keeps)
         for i, (name, values) in enumerate(series.items())
     )
 
@@ -143,7 +152,8 @@ def _clearance(log: EpisodeLog) -> tuple[Line, ...]:
     where = "/plots/clearance"
     if log.clearance_mm is None:
         return ()
-    held = Line(f"{where}/clearance_mm", "clearance_mm", log.clearance_mm, series_colour(0))
+    blue = series_colour(0)
+    held = Line(f"{where}/clearance_mm", "clearance_mm", log.clearance_mm, blue, keeps="Min")
     if not log.limits:
         return (held,)
     limit = np.full(log.rows, log.limits["clearance_mm"])

@@ -97,7 +97,12 @@ class Columns:
 
     def plot(self, line: Line) -> None:
         """Log a line of a plot; rows that are not finite are omitted."""
-        style = rr.SeriesLines(names=line.name, colors=line.colour, widths=line.width)
+        style = rr.SeriesLines(
+            names=line.name,
+            colors=line.colour,
+            widths=line.width,
+            aggregation_policy=line.keeps,
+        )
         self.recording.log(line.entity, style, static=True)
         values = np.asarray(line.values, dtype=np.float64)
         known = np.flatnonzero(np.isfinite(values))

@@ -264,7 +264,7 @@ def _agent(task: DocumentedTask, agent: str, blocks) -> AgentDescription:
         rewards=tuple(
             RewardTerm(term, getattr(weights, term), meanings[term]) for term in term_names(weights)
         ),
-        symbols=" ".join((inspect.getdoc(weights) or "").split("\n\n")[0].split()),
+        symbols=_first(weights),
     )
 
 
@@ -274,8 +274,8 @@ def _summary(build: Any) -> str:
 
 
 def _first(documented: Any) -> str:
-    """First line of a docstring."""
-    return (inspect.getdoc(documented) or "").split("\n")[0]
+    """First paragraph of a docstring, on one line."""
+    return " ".join((inspect.getdoc(documented) or "").split("\n\n")[0].split())
 
 
 def _page(task: TaskDescription) -> str:

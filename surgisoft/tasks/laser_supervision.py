@@ -10,7 +10,14 @@ from torch import Tensor
 
 from surgisoft.tasks.base import TaskState, clearance
 from surgisoft.tasks.laser_work import LaserTask, view
-from surgisoft.tasks.supervision import NEVER, Condition, ExperimentTask, Row
+from surgisoft.tasks.supervision import (
+    MEAN_MM,
+    NEVER,
+    Condition,
+    ExperimentTask,
+    Row,
+    main_error,
+)
 
 
 class LaserSupervision:
@@ -77,8 +84,9 @@ def _retracted(task: LaserTask, state: TaskState, within: float) -> Tensor:
 
 
 def _incomplete(row: Row) -> tuple:
-    """Success first, then the share that was completed, then the beam's error."""
-    error, share = row.get("beam_error_mean_mm"), row.get("completion")
+    """Success first, then the share that was completed, then the error of the beam."""
+    found, share = main_error(row), row.get("completion")
+    error = None if found is None else row[found[0] + MEAN_MM]
     return (1.0 - row["success"], 1.0 - (share or 0.0), error or 0.0)
 
 
@@ -136,8 +144,11 @@ def laser_experiment(
     """
     plain = LASER_EXPERIMENT
     first = {"success": "success", "completion": completion, **numbers}
+    errors = tuple(name for name in numbers if name.endswith(f"error{MEAN_MM}"))
     return replace(
         plain,
+        per_episode=(plain.per_episode[0], *errors, *plain.per_episode[1:]),
+        swept=(*plain.swept[:2], *errors, *plain.swept[2:]),
         conditions={**conditions, **plain.conditions},
         numbers=first | {k: v for k, v in plain.numbers.items() if k not in first},
     )

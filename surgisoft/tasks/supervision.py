@@ -8,7 +8,7 @@ supplements a task that was built. `BEAMLESS` serves every task without a beam;
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -19,8 +19,32 @@ from surgisoft.errors import InputError
 from surgisoft.tasks.base import Task, TaskState
 from surgisoft.tasks.inverse_kinematics import Pointing
 
+MEAN_MM = "_mean_mm"
+"""End of the name of an episode's mean error."""
+DONE, TIME_OUT = "done", "time out"
+"""Begins of the outcomes of episodes that went to their end."""
 Row = dict[str, Any]
 """One episode's results: name -> number or text; None where a number does not apply."""
+
+
+MAIN_ERRORS = {
+    "tissue_error": "error on the tissue",
+    "beam_error": "beam error",
+    "error": "error",
+}
+"""Errors of which one sentence states the first that a task measures -> their titles. The error on
+the tissue is that of the burn; beside it the beam's is only that of where it has to point.
+"""
+
+
+def main_error(names: Iterable[str]) -> tuple[str, str] | None:
+    """(name, title) of the error that sums an episode up, among the names of its numbers.
+
+    The name is without `_mean_mm`. Of a task that measures none of `MAIN_ERRORS` the first one.
+    """
+    found = [n.removesuffix(MEAN_MM) for n in names if n.endswith(f"error{MEAN_MM}")]
+    name = next((known for known in MAIN_ERRORS if known in found), next(iter(found), None))
+    return None if name is None else (name, MAIN_ERRORS.get(name, name.replace("_", " ")))
 
 
 @dataclass(frozen=True)
@@ -150,9 +174,16 @@ SUCCEEDED = Condition("the task's measure of success is at least this (0..1)", 1
 
 
 def _unsuccessful(row: Row) -> tuple:
-    """Success first, then the mean error where there is one."""
+    """Success first, or without such a measure the end in time; then the mean error where there is
+    one."""
     errors = [value for name, value in row.items() if name.endswith("error_mean_mm")]
-    return (1.0 - row["success"], *(error or 0.0 for error in errors))
+    well = row["success"] if "success" in row else ended_well(row)
+    return (1.0 - well, *(error or 0.0 for error in errors))
+
+
+def ended_well(row: Row) -> bool:
+    """Whether an episode went to its end: no abort, no contact, all arms finite."""
+    return row["outcome"].startswith((DONE, TIME_OUT))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,15 @@ import pytest
 import torch
 from scipy.stats import binomtest
 
-from surgisoft.agents.evaluate import Evaluation, episode_table, student, summary, wilson
+from surgisoft.agents.evaluate import (
+    Evaluation,
+    cell,
+    cells_are,
+    episode_table,
+    student,
+    summary,
+    wilson,
+)
 from surgisoft.agents.exact_checks import Contact, EpisodeCheck
 from surgisoft.agents.rollout import Rollout
 from surgisoft.agents.run_folder import PACKAGED
@@ -83,6 +91,21 @@ def test_one_episode_has_no_interval():
     found = summary("time_s", np.array([4.0]))
     assert (found.mean, found.episodes) == (4.0, 1)
     assert np.isnan([found.low, found.high]).all()
+
+
+def test_of_few_episodes_a_cell_has_the_least_and_the_greatest_number():
+    """Two clearances of 11.39 and 14.19 mm: Student's interval of their mean, 12.706 standard
+    errors of 1.4 mm to either side, would look like contact."""
+    two = summary("clearance_mm", np.array([11.39, 14.19]))
+    assert two.low == pytest.approx(12.79 - 12.706 * 1.4, abs=1e-3)
+    assert cell("clearance_mm", two) == "12.79 (11.39 to 14.19)"
+    hit = summary("success", np.array([1.0, 0.0]))
+    assert cell("success", hit) == "50.0% [9.5%, 90.5%]", "Wilson's holds for any number"
+    assert cells_are([{"success": hit}]) == "mean [95 % interval]"
+    assert cells_are([{"success": hit, "clearance_mm": two}]).endswith("or (least to greatest)")
+    five = summary("clearance_mm", np.array([1.0, 2.0, 3.0, 4.0, 5.0]))
+    assert cell("clearance_mm", five) == "3 [1.037, 4.963]"
+    assert cells_are([{"clearance_mm": five}]) == "mean [95 % interval]"
 
 
 def test_a_summary_leaves_out_what_does_not_apply():

@@ -131,4 +131,12 @@ def test_an_error_that_never_applied_is_no_number_of_the_verdict():
         )
     ]
     said = verdict("t", found)
-    assert said == "Task t, 9 episodes each. a: 0% success; b: 0% success, mean error 0.4 mm."
+    assert said == "Task t, 9 episodes each. a: 0% success; b: 0% success, mean beam error 0.4 mm."
+
+
+def test_the_verdict_states_the_error_on_the_tissue_where_there_is_one():
+    """A gated beam that points exactly may burn beside its place on the moving organ."""
+    beam, tissue = (Summary(mean, mean, mean, mean, mean, 9) for mean in (0.002, 0.2))
+    overall = {"beam_error_mean_mm": beam, "tissue_error_mean_mm": tissue}
+    found = [SimpleNamespace(policy="a", overall=overall, episodes=9)]
+    assert verdict("t", found) == "Task t, 9 episodes each. a: mean error on the tissue 0.2 mm."

@@ -11,6 +11,7 @@ from surgisoft.agents import report_charts
 from surgisoft.agents.report_charts import (
     clearance_chart,
     error_chart,
+    path_chart,
     spread_chart,
     sweep_chart,
 )
@@ -67,6 +68,34 @@ def test_an_error_without_bound_leaves_a_gap(monkeypatch):
     log.clearance_mm, log.limits = np.array([-np.inf, 3.0, -2.0, np.nan, np.inf]), {}
     axis, _ = drawn(monkeypatch, lambda: clearance_chart(log))
     assert axis.get_ylim()[0] == pytest.approx(-2.2)
+
+
+def test_on_an_organ_that_moves_the_error_is_that_on_the_tissue(monkeypatch):
+    measures = {"beam_error_mm": np.array([0.1, 0.1]), "tissue_error_mm": np.array([0.4, 0.75])}
+    log = SimpleNamespace(measures=measures, time_s=np.arange(2.0), beams={"laser": None})
+    axis, caption = drawn(monkeypatch, lambda: error_chart(log))
+    np.testing.assert_array_equal(axis.lines[0].get_ydata(), [0.4, 0.75])
+    assert axis.get_title() == "error on the tissue while the beam is on"
+    assert caption == "Largest 0.75 mm"
+
+
+def test_targets_in_turn_are_points_and_the_way_between_them_has_no_gap(monkeypatch):
+    """Three targets 12 to 14 mm apart, and an arm that passes between two of them in a step."""
+    places = np.array([[8.0, 0.0, 0.0], [-4.0, 7.0, 0.0], [-4.0, -7.0, 0.0]])
+    log = SimpleNamespace(
+        path_mm=np.zeros((0, 3)), paths_mm=[], target_mm=np.repeat(places, 5, axis=0),
+        actual_mm=np.repeat(places, 5, axis=0) + 0.1, rows=15, beams={}, one_ring=False,
+    )  # fmt: skip
+    axis, _ = drawn(monkeypatch, lambda: path_chart(log))
+    reference, points, done = (np.stack(line.get_data(), axis=1) for line in axis.lines)
+    assert np.isnan(reference).any(), "no line where the target jumps"
+    apart = np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1)
+    np.testing.assert_allclose(sorted(apart), [193.0**0.5, 193.0**0.5, 14.0], rtol=1e-6)
+    assert np.isfinite(done).all()
+    moving = np.arange(15.0)
+    log.target_mm = np.stack((moving, moving**2 / 99.0, 0.0 * moving), axis=1)
+    axis, _ = drawn(monkeypatch, lambda: path_chart(log))
+    assert len(axis.lines) == 2, "one that moves has no such points"
 
 
 def test_shares_are_drawn_from_0_to_1(monkeypatch):

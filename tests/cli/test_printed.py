@@ -121,7 +121,7 @@ def test_compare_advises_to_diagnose_the_closest_of_several_models(
     assert out.endswith(f"from the model of the smallest error: surgisoft diagnose {path} {rec}\n")
 
 
-def summary(mean: float, episodes: int = 3) -> SimpleNamespace:
+def summary(mean: float, episodes: int = 9) -> SimpleNamespace:
     ends = {"least": mean - 1.0, "most": mean + 1.0, "episodes": episodes}
     return SimpleNamespace(mean=mean, low=mean - 0.1, high=mean + 0.1, **ends)
 

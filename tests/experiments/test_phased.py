@@ -19,8 +19,10 @@ from surgisoft.experiments.phases import CLOSE, LATE, LOST, PhasedTask
 from surgisoft.experiments.plan import settings
 from surgisoft.experiments.run import roll_out_block
 from surgisoft.experiments.spec import Fault, load_experiment
+from surgisoft.replay.plots import plots_of
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.circle_ablation import CircleAblation
+from surgisoft.tasks.episodes.log import EpisodeRecorder
 from surgisoft.tasks.laser_supervision import LASER_EXPERIMENT, LaserSupervision
 from surgisoft.tasks.registry import make_task
 from tests.experiments.tiny import FAULT, TINY, write
@@ -88,6 +90,21 @@ def test_an_experiment_cannot_loosen_the_scene_s_clearance(cutting, spec, base):
     assert (
         not PhasedTask(LaserSupervision(base), strict).released(_with(state, clearance=6.9)).any()
     )
+
+
+def test_the_log_and_its_charts_have_the_limit_that_holds(spec, base):
+    """The stricter of the file's and the scene's, which the log alone would state as 1 mm."""
+    assert base.spec.limits.clearance_mm == 1.0
+    for given, holds in ((100.0, 100.0), (0.5, 1.0)):
+        phased = replace(spec, limits=replace(spec.limits, clearance_mm=given))
+        task = PhasedTask(LaserSupervision(base), phased)
+        state = Episodes(task).seeded(0, 1)
+        log = EpisodeRecorder(task, state, policy="scripted", seed=0).log()
+        assert log.limits["clearance_mm"] == holds
+        (drawn,) = (line for plot in plots_of(log) for line in plot.lines if line.name == "limit")
+        assert set(drawn.values.tolist()) == {holds}
+        told = [event.text for event in log.events if event.text.startswith("closer")]
+        assert told == (["closer than 100 mm"] if holds > 1.0 else [])
 
 
 def _walk(task, state, steps, **world):

@@ -53,6 +53,7 @@ def spec_of(folder, text: str = TINY):
         ("task.fire_mm", "1.0, 1.0", "'simulation_fire_mm=1' appears twice; expected values that"),
         ("hidden.creep", "-1.0", "got -1.0; expected amplitudes from 0"),
         ("hidden.creep", '"much"', "got 'much'; expected amplitudes from 0"),
+        ("hidden.creep", "[1.0, 2.0]", "got (1.0, 2.0); expected amplitudes from 0"),
         ("fault.chamber", "0", "got 0; expected what a fault has as chamber"),
         ("fault.at_s", "-0.5", "got -0.5; expected what a fault has as at_s"),
     ],
@@ -74,6 +75,10 @@ def test_hidden_effects_and_robots_vary_on_the_rig(tmp_path):
         (3, (("creep", 2.0),)),
         (4, (("creep", 2.0),)),
     ]
+    plain = spec_of(tmp_path, TINY + '[[cases]]\nname = "plain"\n' + text.removeprefix(TINY))
+    labels = [each.label for each in settings(plain)]
+    assert labels[0] == "plain", "once: in simulation the two make no difference"
+    assert labels[1:] == [each.label for each in settings(spec)]
     wrong = RIG + 'hidden = ["creep:much"]\n'
     with pytest.raises(InputError, match=r"got 'creep:much'; expected NAME or NAME:STRENGTH"):
         settings(spec_of(tmp_path, TINY + wrong))

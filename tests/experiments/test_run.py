@@ -22,7 +22,7 @@ from surgisoft.cli import run
 from surgisoft.errors import InputError
 from surgisoft.experiments import run as experiment_run
 from surgisoft.experiments import spec as experiment_spec
-from surgisoft.experiments.page import rules
+from surgisoft.experiments.page import rules, verdict
 from surgisoft.experiments.plan import build_task, settings
 from surgisoft.experiments.results import drop_logs, sum_up
 from surgisoft.experiments.run import open_results, run_experiment
@@ -32,7 +32,7 @@ from surgisoft.report import Picture
 from surgisoft.scene.spec import PHANTOM
 from surgisoft.tasks.circle_ablation import CircleAblationConfig, success_rule
 from surgisoft.tasks.registry import spec_of
-from tests.experiments.tiny import TINY, write
+from tests.experiments.tiny import BREATHING, TINY, write
 from tests.report.browser import chromium, look
 
 PLAYED: dict = {}
@@ -458,6 +458,55 @@ def test_a_fault_that_never_came_is_said_to_have_not(tmp_path, capsys):
     assert "got 'succeeded'; expected one of at rest, never" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_a_task_without_a_measure_of_success_has_no_rate_of_it(tmp_path, capsys):
+    """As `evaluate` prints none; what the verdict counts is who went to the end."""
+    file = tmp_path / "path.toml"
+    phase = '[[phases]]\nname = "go"\ntimeout_s = 0.3\non_timeout = "go on"\narm = "policy"\n'
+    file.write_text(f'name = "path"\nscenario = "track_circle"\nrepeats = 2\n{phase}')
+    folder = tmp_path / "r"
+    assert run(["experiment", "run", str(file), "-o", str(folder), "--no-replays"]) == 0
+    rows, printed = _rows(folder), capsys.readouterr().out
+    assert printed.startswith("'simulation': 2 of 2 episodes went to their end.")
+    assert "success" not in rows[0]
+    assert "| success |" not in printed
+    assert "track_circle has no measure of success, so no rate of it is stated." in printed
+    assert 'class="verdict plain"' in (folder / "report.html").read_text()
+    file.write_text(file.read_text().replace("go on", "abort"))
+    assert run(["experiment", "run", str(file), "-o", str(folder), "--no-replays", "--force"]) == 0
+    assert "'simulation': 0 of 2 episodes went to their end" in capsys.readouterr().out
+    spec = load_experiment(file)
+    each = spec_of("track_circle").experiment
+    worst = [each.badness({"outcome": o, "error_mean_mm": e}) for o, e in WORSE]
+    assert worst == sorted(worst)
+    many = [{**row, "setting": f"s{i}"} for i, row in enumerate(rows * 3)]
+    for row, error in zip(many, (0.5, 0.3, 0.9, 0.4, 0.6, 0.7), strict=True):
+        row["error_mean_mm"] = error
+    assert verdict(sum_up(spec, folder, many)) == (
+        "6 of 6 episodes went to their end, mean error from 0.3 mm ('s1') to 0.9 mm ('s2')."
+    )
+
+
+WORSE = (("done", 0.1), ("time out", 0.2), ("aborted in go: phase took too long", 0.0))
+"""Outcomes and errors of episodes without a measure of success, from good to bad."""
+
+
+def test_the_verdict_of_a_burn_on_a_moving_organ_is_its_error_on_the_tissue(tmp_path):
+    """A gated beam that points exactly may burn beside its place: that error, and its worst."""
+    spec = load_experiment(write(tmp_path, BREATHING))
+    same = {"setting": "gated", "case": "gated", "outcome": "done", "success": 1.0}
+    same |= {"completion": 1.0, "time_s": 9.0, "beam_unsafe_longest_s": 0.0}
+    beam, tissue = (0.004, 0.002), (0.1, 0.3)
+    rows = [
+        {**same, "episode": k, "beam_error_mean_mm": beam[k], "tissue_error_mean_mm": tissue[k]}
+        for k in range(2)
+    ]
+    results = sum_up(spec, tmp_path, rows)
+    said = "'gated': success 2 of 2, mean error on the tissue 0.2 mm."
+    assert verdict(results).startswith(said)
+    assert results.worst == ("gated", 1)
+
+
 def test_the_rule_of_success_has_the_values_of_all_settings(tmp_path):
     """Not the file's, or the default of 45 s, which is that of no setting."""
 
@@ -473,3 +522,8 @@ def test_the_rule_of_success_has_the_values_of_all_settings(tmp_path):
     assert "around in 10 to 50 s (cut_s)" in said(TINY + many)
     other = vary.replace("task.fire_mm", "task.world.randomisation.mount_mm")
     assert said(TINY + other) == said(TINY), "not in the rule"
+    area = 'scenario = "area_ablation"\n' + TINY.replace('"cut"\ntimeout', '"treated"\ntimeout')
+    margins = vary.replace("task.fire_mm", "task.spared_mm").replace("0.5, 5.0", "0.5, 2.0")
+    assert "healthy tissue more than 0.5 or 2 mm outside are ablated" in said(area + margins)
+    modes = '\n[[vary]]\nfield = "task.mode"\nvalues = ["follow", "gated"]\n'
+    assert said(BREATHING + modes).endswith("(mode: the setting's value); nothing is aborted.")

@@ -10,11 +10,11 @@ import pytest
 from surgisoft.cli import run
 from surgisoft.config import Where, read_toml
 from surgisoft.errors import InputError
-from surgisoft.experiments.plan import rig_config, settings
-from surgisoft.experiments.session import find_experiment, with_rigs
+from surgisoft.experiments.plan import configured, rig_config, settings
+from surgisoft.experiments.session import ExperimentRules, find_experiment, with_rigs
 from surgisoft.experiments.spec import load_experiment, save_experiment
 from surgisoft.scene.spec import PHANTOM
-from tests.experiments.tiny import FAULT, TINY, write
+from tests.experiments.tiny import BREATHING, FAULT, TINY, write
 
 SHIPPED = sorted((PHANTOM / "experiments").glob("*.toml"))
 
@@ -80,6 +80,7 @@ VARY = '[[vary]]\nfield = "{field}"\nvalues = [{values}]\n'
     [
         ("task.fire_mm", "1.0, -1.0", "vary[0].values[1]"),
         ("task.fire_mn", "1.0", "vary[0].values[0]"),
+        ("task.fire_mm", "1.0, [1.0, 2.0]", "vary[0].values[1]"),
         ("hidden.grep", "1.0", "vary[0].field"),
         ("fault.chamber", "1", "vary[0].field"),
         ("mount", "1.0", "vary[0].field"),
@@ -100,6 +101,26 @@ def test_what_varies_makes_a_grid(tmp_path):
     assert [setting.number for setting in found] == list(range(6))
     assert found[4].label == "simulation_fire_mm=1_chamber=2"
     assert dict(found[4].values) == {"task.fire_mm": 1, "fault.chamber": 2}
+
+
+def test_a_field_of_several_numbers_varies_over_lists(tmp_path):
+    field = "task.respiration.amplitude_mm"
+    text = BREATHING + VARY.format(field=field, values="[2, 2], [10.0, 12.5]")
+    path = write(tmp_path, text + VARY.format(field="task.cut_s", values="20.0"))
+    spec = load_experiment(path)
+    found = settings(spec, read_toml(path)[1])
+    amplitudes = [configured(spec, each.values).respiration.amplitude_mm for each in found]
+    assert amplitudes == [(2.0, 2.0), (10.0, 12.5)]
+    assert [each.label for each in found] == [
+        "simulation_amplitude_mm=2-2_cut_s=20",
+        "simulation_amplitude_mm=10-12.5_cut_s=20",
+    ]
+    assert found[1].words == "simulation, amplitude_mm [10, 12.5], cut_s 20.0"
+    assert found[1].columns == {field: "[10, 12.5]", "task.cut_s": 20.0}, "cells of a table"
+    save_experiment(spec, tmp_path / "experiment.toml")
+    assert load_experiment(tmp_path / "experiment.toml") == spec
+    (said,) = ExperimentRules(spec).left_out
+    assert f"{field} ([2, 2], [10, 12.5], here [5, 20])" in said
 
 
 def test_large_numbers_have_labels_of_their_own(tmp_path):

@@ -40,6 +40,18 @@ chamber = 3
 at_s = 1.7
 """
 
+BREATHING = """
+name = "breaths"
+scenario = "breathing_ablation"
+scene = "{scene}"
+
+[[phases]]
+name = "cut"
+laser = "policy"
+beam = true
+timeout_s = 30.0
+"""
+
 
 def write(folder: Path, text: str = TINY, name: str = "tiny.toml") -> Path:
     """The experiment's file in a folder, its scene the liver phantom."""

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from rerun.components import AggregationPolicy
 from scipy.spatial.transform import Rotation
 
 from surgisoft.cli import run
@@ -79,6 +80,20 @@ def test_plots_hold_every_step_of_the_log(log, replay):
         known = np.flatnonzero(np.isfinite(values))
         assert list(held) == known.tolist()
         np.testing.assert_allclose(np.ravel([*held.values()]), values[known])
+
+
+@pytest.mark.parametrize(
+    ("entity", "kept"),
+    [
+        ("error/beam_error_mm", AggregationPolicy.Max),
+        ("clearance/clearance_mm", AggregationPolicy.Min),
+        ("pressure/laser/p1", AggregationPolicy.Average),
+    ],
+)
+def test_peaks_of_errors_and_clearances_stay_in_sight(entity, kept, replay):
+    """Where several steps share a column of pixels, the viewer would draw their mean."""
+    held = column(replay.path, f"/plots/{entity}", "SeriesLines:aggregation_policy")
+    assert held == {-1: [kept.value]}
 
 
 def test_both_timelines_tell_the_same_moment(log, replay):

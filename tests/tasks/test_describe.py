@@ -75,6 +75,15 @@ def test_every_randomised_quantity_is_listed():
     assert told == dataclasses.asdict(Randomisation())
 
 
+@every_task
+def test_summaries_and_ends_are_whole_sentences(name):
+    """A docstring's first sentence may go on in its second line."""
+    told = describe(name)
+    assert told.summary.endswith(".")
+    assert told.ends.endswith(".")
+    assert "\n" not in told.summary + told.ends
+
+
 def test_the_docs_hold_the_present_pages():
     """Renew with `python -m surgisoft.tasks.describe docs/environments`."""
     written = pages()

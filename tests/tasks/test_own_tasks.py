@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import math
 import re
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ import torch
 import surgisoft
 from surgisoft.cli import run
 from surgisoft.errors import InputError
+from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.registry import TASKS, make_task, spec_of, task_names
 from surgisoft.tasks.single import BatchedEnv
 
@@ -73,6 +75,35 @@ def test_it_is_trained_and_evaluated_by_its_name(installed, tmp_path, monkeypatc
     told = capsys.readouterr().err
     assert "own: was trained on the task 'smooth_circle', which is not installed here" in told
     assert f"install {config['task_package']} first" in told
+
+
+def test_the_laser_task_of_the_page_waits_at_its_places_in_their_order(tmp_path, monkeypatch):
+    """Opposite places after each other, each until the beam was on for 1.5 s, and then the end."""
+    source = re.search(r'```python title="my_tasks/spots.py"\n(.*?)```', PAGE.read_text(), re.S)[1]
+    (tmp_path / "spots_of_the_page.py").write_text(source)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    spec = importlib.import_module("spots_of_the_page").FOUR_SPOTS
+    task = spec.build(None, "cpu")
+    episodes, targets, on, errors = Episodes(task), [], [], []
+    state, ended = episodes.seeded(0, 1), False
+    while not ended and len(on) < task.steps:
+        targets.append(task.target_mm(state)[0])
+        state, outcome = episodes.step(state, task.script(state))
+        on.append(bool(state.goal.fired))
+        errors.append(float(outcome.measures["beam_error_mm"]))
+        ended = bool(outcome.terminated)
+    assert ended
+    assert float(outcome.measures["success"]) == 1.0
+    ring = task.scene.paths_mm[0]
+    count = len(ring)
+    turns = [int((ring - target).norm(dim=1).argmin()) for target in targets]
+    order = [round(4.0 * place / count) for place, lit in zip(turns, on, strict=True) if lit]
+    assert order == [0] * 15 + [2] * 15 + [1] * 15 + [3] * 15
+    known = [error for error in errors if not math.isnan(error)]
+    assert len(known) == 4 * 14, "without the steps after which the next place is the target"
+    assert max(known) < 1.0
+    said = spec.success_rule(task.config)
+    assert said.startswith("the beam was on for 1.5 s at each of 4 places")
 
 
 def of_rewards(rewards):

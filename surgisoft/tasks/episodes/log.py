@@ -26,6 +26,8 @@ from surgisoft.tasks.world.arm import radius_mm
 from surgisoft.tasks.world.respiration import MOVING
 from surgisoft.tasks.world.scene import ObstacleEngine, SceneEngine
 
+DONE = "done"
+"""Event at the end of an episode that went as it should."""
 EARLY = "ended early"
 """Event at the end of an episode that ended before its time without success."""
 JUMP_MM = 3.0
@@ -238,15 +240,20 @@ class EpisodeRecorder:
             **self._paths(near),
             measures=_below(rows, "measures/"),
             rewards={agent: _below(rows, f"rewards/{agent}/") for agent in task.agents},
-            limits={} if near is None else _limits(near),
+            limits={} if near is None else _limits(near) | self._stricter(),
         )
         if near is not None:
             log = replace(log, **self._scene_fields(near, rows))
         elif isinstance(around, ObstacleEngine):
             bodies = tuple(_body(body) for body in around.geometry.bodies)
-            limits = {"clearance_mm": around.clearance_mm}
+            limits = {"clearance_mm": around.clearance_mm} | self._stricter()
             log = replace(log, bodies=bodies, limits=limits, clearance_mm=rows["clearance"])
         return replace(log, events=find_events(log, self._ending))
+
+    def _stricter(self) -> dict[str, float]:
+        """The limit of clearance of an experiment's phases, which holds in place of the scene's."""
+        clear_mm = getattr(self.task, "clear_mm", None)
+        return {} if clear_mm is None else {"clearance_mm": float(clear_mm)}
 
     def _of(self, tensor: Tensor) -> np.ndarray:
         """A copy of the recorded environment's row of a tensor."""
@@ -450,5 +457,5 @@ def _end(log: EpisodeLog, ending: str) -> tuple[str, str]:
         return "error", "an arm is no longer finite"
     success = log.measures.get("success")
     if success is None or success[-1] > 0.0:
-        return "info", "done"
+        return "info", DONE
     return ("warning", "the time has elapsed") if ending == "time out" else ("error", EARLY)

@@ -14,8 +14,6 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.scene.mounted_arm import AXIS_MM
-from surgisoft.scene.spec import WALL
 from surgisoft.tasks.base import FEED_SIGNAL, Signal, TaskState, clearance
 from surgisoft.tasks.laser_supervision import LASER_EXPERIMENT
 from surgisoft.tasks.laser_work import (
@@ -36,8 +34,8 @@ from surgisoft.tasks.spec import TaskSpec
 from surgisoft.tasks.trajectories.closed_path import RingCut, draw_cut
 from surgisoft.tasks.world.arm import Randomisation
 from surgisoft.tasks.world.random_streams import Stream
-from surgisoft.tasks.world.scene import PHANTOM
-from surgisoft.tasks.world.world import Feed, WorldConfig
+from surgisoft.tasks.world.scene import PHANTOM, WALL
+from surgisoft.tasks.world.world import AXIS_MM, Feed, WorldConfig
 
 PORTS = PHANTOM / "ports.toml"
 """The liver phantom below a wall with two ports."""

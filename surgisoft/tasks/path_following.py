@@ -248,11 +248,11 @@ class Follow:
             """Best pressures (R, m) for R points from starts (R, S, m), and distances (R,) mm."""
             wanted = target[rows].repeat_interleave(starts.shape[1], 0)
             tried = starts.flatten(0, 1)
-            bounds = (edge.expand(len(tried), -1) for edge in (low, high))
             found = least_squares(
                 lambda pressure: point(pressure) - wanted,
                 tried,
-                *bounds,
+                low.expand(len(tried), -1),
+                high.expand(len(tried), -1),
                 iterations=20,
                 hold_at_limits=True,
             )

@@ -24,6 +24,7 @@ from surgisoft.scene.mesh import Body
 from surgisoft.scene.moving import Placement
 from surgisoft.scene.rays import RayHit, Struck
 from surgisoft.scene.spec import PHANTOM as PHANTOM
+from surgisoft.scene.spec import WALL as WALL
 from surgisoft.tasks.world.arm import ArmPart, LoneArm, Randomisation
 from surgisoft.tasks.world.pytree import overwritable
 from surgisoft.tasks.world.random_streams import Stream

@@ -20,6 +20,7 @@ from torch import Tensor
 from surgisoft.command_line import typed
 from surgisoft.errors import AssumptionWarning, InputError
 from surgisoft.scene.folder import Scene, open_scene
+from surgisoft.scene.mounted_arm import AXIS_MM as AXIS_MM
 from surgisoft.scene.mounted_arm import FEED_MM
 from surgisoft.scene.spec import MountSpec
 from surgisoft.surrogate.backbone import TIP_TASKS

@@ -1,5 +1,6 @@
 """Faults of a set-up that were put into recordings are named, corrected, and told from physics."""
 
+from collections import OrderedDict
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.diagnosis.setup import find_setup_faults, find_small_frame
 from surgisoft.diagnosis.setup.arrangements import mistaken
-from surgisoft.diagnosis.setup.sample import samples_of
+from surgisoft.diagnosis.setup.sample import Sample, samples_of
 from surgisoft.diagnosis.setup.search import Levels, Proof, Search
 from surgisoft.surrogate.checkpoint import default_arm
 from tests.diagnosis.setup.recordings import (
@@ -106,6 +107,36 @@ SINGLE = {
     "late": (lambda r: late(r, 6), "time", "s late relative to the actuation"),
     "early": (lambda r: late(r, -4), "time", "s early relative to the actuation"),
 }
+
+
+KEPT = 24
+"""Predictions that are kept, of some MB each."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _each_prediction_once():
+    """A model's prediction of one actuation at the same times in the same arrangements is computed
+    once: most faults leave the actuation as it is, and all are looked for in one recording."""
+    kept: OrderedDict[tuple, object] = OrderedDict()
+    compute = Sample.predicted_single
+
+    def once(sample, arrangements):
+        model, history = sample.model, sample.history
+        signals = (history.t_s, history.pressure, history.valid, history.temperature_C)
+        signals += (history.stood, *model.state_dict().values())
+        key = repr((model.spec, model.effects, model.network)), tuple(arrangements)
+        key += tuple(None if each is None else each.numpy().tobytes() for each in signals)
+        if key not in kept:
+            kept[key] = compute(sample, arrangements)
+            kept[key].flags.writeable = False
+        kept.move_to_end(key)
+        while len(kept) > KEPT:
+            kept.popitem(last=False)
+        return kept[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Sample, "predicted_single", once)
+        yield
 
 
 @pytest.fixture(scope="module")

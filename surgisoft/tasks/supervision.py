@@ -22,7 +22,7 @@ from surgisoft.tasks.inverse_kinematics import Pointing
 MEAN_MM = "_mean_mm"
 """End of the name of an episode's mean error."""
 DONE, TIME_OUT = "done", "time out"
-"""Begins of the outcomes of episodes that went to their end."""
+"""Beginnings of the outcomes of episodes that went to their end."""
 Row = dict[str, Any]
 """One episode's results: name -> number or text; None where a number does not apply."""
 

@@ -386,7 +386,7 @@ def test_a_chance_says_what_it_counts(validated_mm, said):
         validated_mm=validated_mm,
     )
     assert said in found.chances_in_words
-    assert "and not for other causes, which 'surgisoft diagnose' weighs too" in (
+    assert "but not for other causes: 'surgisoft diagnose' weighs those too" in (
         found.chances_in_words
     )
     assert found.to_json()["chances_in_words"] == found.chances_in_words

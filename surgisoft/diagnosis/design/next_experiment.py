@@ -674,11 +674,11 @@ class Recommendation:
         else:
             error += f" ({self.validated_mm:.2g} mm)"
         return (
-            "a chance is that of naming the right one of the two where one of them, alone and as "
-            "large as expected, is what is missing; it allows for the noise of the cameras, "
-            f"{error} and the effects' own misfit, and not for other causes, which 'surgisoft "
-            "diagnose' weighs too: with a chance near 1 it may still answer cannot_tell or give a "
-            "set"
+            "a chance is the probability of naming the right one of the two if only that one is "
+            "missing and is as large as expected; it allows for the noise of the cameras, "
+            f"{error} and the misfit of the effects themselves, but not for other causes: "
+            "'surgisoft diagnose' weighs those too, so it may answer cannot_tell or name a set even "
+            "where the chance is near 1"
         )
 
     def to_json(self) -> dict:

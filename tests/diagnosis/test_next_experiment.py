@@ -372,7 +372,10 @@ def test_an_experiment_that_is_not_needed_says_what_else_may_be_the_matter(befor
             0.0523,
             "the noise of the cameras, 2 times the validated error of the model (0.052 mm)",
         ),
-        (None, "2 times an error of the model of 5 % of its length and the effects' own misfit"),
+        (
+            None,
+            "2 times an error of the model of 5 % of its length and the misfit of the effects themselves",
+        ),
     ],
 )
 def test_a_chance_says_what_it_counts(validated_mm, said):

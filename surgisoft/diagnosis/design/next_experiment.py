@@ -677,8 +677,8 @@ class Recommendation:
             "a chance is the probability of naming the right one of the two if only that one is "
             "missing and is as large as expected; it allows for the noise of the cameras, "
             f"{error} and the misfit of the effects themselves, but not for other causes: "
-            "'surgisoft diagnose' weighs those too, so it may answer cannot_tell or name a set even "
-            "where the chance is near 1"
+            "'surgisoft diagnose' weighs those too, so it may answer cannot_tell or name a set "
+            "even where the chance is near 1"
         )
 
     def to_json(self) -> dict:

@@ -374,7 +374,7 @@ def test_an_experiment_that_is_not_needed_says_what_else_may_be_the_matter(befor
         ),
         (
             None,
-            "2 times an error of the model of 5 % of its length and the misfit of the effects themselves",
+            "2 times an error of the model of 5 % of its length and the misfit of the effects",
         ),
     ],
 )

@@ -41,6 +41,8 @@ LIFT_MM = 0.5
 """Height of drawings above the surface they lie on, so that it does not hide them (mm)."""
 BAR_SHARE = 0.3
 """Length of the scale bar over the organ's size, before it is rounded."""
+NAME_BEHIND = 3.0
+"""Distance of an arm's name behind its base over the arm's radius, where there is a shaft."""
 FRAMES = 72
 """Number of frames, during which the laser goes once around the ring."""
 
@@ -65,6 +67,8 @@ def save_scene_view(scene: Scene, reaches: dict[str, ArmReach], path: Path) -> N
             _log_shaft(recording, name, arms[name])
             _log_arm(recording, name, "tip", arms[name], touch.way_mm[0], static=True)
         _log_lasers(recording, arms, cuts)
+        for name, arm in arms.items():
+            _log_name(recording, name, arm)
 
 
 def blueprint(scene: Scene, arms: dict[str, MountedArm]) -> rrb.Blueprint:
@@ -234,6 +238,19 @@ def _log_shaft(recording, name: str, arm: MountedArm) -> None:
         ),
         static=True,
     )
+
+
+def _log_name(recording, name: str, arm: MountedArm) -> None:
+    """Log the arm's name on its shaft near the base, at a point inside the arm.
+
+    On the dark shaft the name is easier to read than on the bright soft body.
+    """
+    behind = min(arm.shaft_mm, NAME_BEHIND * arm.reach.radius_mm)
+    place = arm.pose[:3, 3] - behind * arm.pose[:3, 2]
+    label = rr.Points3D(
+        [place], radii=[0.1], colors=[MEASURED_COLOUR], labels=[name], show_labels=True
+    )
+    recording.log(f"/arms/{name}/name", label, static=True)
 
 
 def _log_endoscope(

@@ -100,6 +100,16 @@ def test_the_legend_names_what_is_there_and_the_bar_has_its_length(recording):
     assert label == f"{np.linalg.norm(np.subtract(end, start)):g} mm"
 
 
+def test_each_arm_carries_its_name_on_the_shaft_near_its_base(recording):
+    for mount in open_scene(PHANTOM).spec.mounts:
+        (label,) = column(recording, f"/arms/{mount.tool}/name", "Points3D:labels")[-1]
+        assert label == mount.tool
+        (place,) = column(recording, f"/arms/{mount.tool}/name", "Points3D:positions")[-1]
+        back = np.subtract(mount.position_mm, place)  # mm, along the axis of the shaft
+        assert 0.5 * mount.diameter_mm < back @ mount.direction < 0.5 * mount.shaft_mm
+        np.testing.assert_allclose(np.cross(back, mount.direction), 0.0, atol=1e-3)
+
+
 def test_the_recording_holds_the_whole_scene(recording):
     rows: dict[str, int] = {}
     for chunk in RrdReader(recording).stream():

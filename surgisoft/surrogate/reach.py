@@ -8,9 +8,15 @@ import torch
 from surgisoft.errors import AssumptionWarning, InputError
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.model import ArmModel
+from surgisoft.units import MM_PER
 
 COUNTS = {1: 41, 2: 41, 3: 15, 4: 8, 5: 6, 6: 5}
 """Samples of each chamber's range, by the number of chambers: at most 16,000 centrelines."""
+LEAST_BODY_MM = 3.0
+"""A body below this length, at rest, is in another unit than mm: no arm with a tool is so short."""
+SAME_LENGTH = 1.5
+"""Ratio up to which the body of a model has the length that the model states, once a wrong unit is
+corrected: an arm that stretches is longer than at rest."""
 
 
 def model_table(
@@ -75,3 +81,39 @@ def steady_key_points(model: ArmModel, actuation: np.ndarray) -> np.ndarray:
         state = model.initial_state(len(pressure), pressure)
         _, points = model.step(state, torch.zeros_like(pressure), 1.0)
     return points.double().cpu().numpy()
+
+
+def require_millimetres(model: ArmModel, label: str) -> None:
+    """Raise InputError where the key points of an arm are in another unit of length than mm.
+
+    They are where a unit brings the body's length at rest to the one that the model states, or
+    where the body is too short for an arm: then metres or another unit stand for mm in both. The
+    length of an arm with one key point counts from the origin; if its tip moves farther than that,
+    the origin is not the base and the length is not known.
+
+    label: the arm, for the message.
+    """
+    spec, points = model.spec, model.rest_mm.double().cpu().numpy()
+    if spec.key_points == 1:
+        points = np.vstack((np.zeros(3), points))
+    body = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+    if spec.key_points == 1:
+        alone = np.where(np.eye(spec.chambers) > 0, spec.high, spec.rest)
+        moved = steady_key_points(model, alone)[:, -1] - points[-1]
+        if np.linalg.norm(moved, axis=1).max() > body:
+            return
+    came = f"{label}: returns key points in {{}}: along the body, base to tip, they are {body:.3g}"
+    advice = "expected mm: multiply them by {:g}"
+    for unit, by in MM_PER.items():
+        stated = spec.length_mm
+        if by > 1.0 and stated and abs(np.log(by * body / stated)) < np.log(SAME_LENGTH):
+            raise InputError(
+                f"{came.format(unit)} long, where the arm is {stated:.4g} mm long; "
+                f"{advice.format(by)}"
+            )
+    if body < LEAST_BODY_MM:
+        unit = "m" if body < 1.0 else "cm"
+        raise InputError(
+            f"{came.format(unit)} long, where an arm is {LEAST_BODY_MM:g} mm long or more; "
+            f"{advice.format(MM_PER[unit])}, and so its length_mm"
+        )

@@ -59,6 +59,50 @@ def test_what_cannot_be_meant_is_one_line(make, message):
     assert message in refusal(make)
 
 
+OWN_ARM = """
+import numpy as np
+class Arm:
+    static, error_mm, low, high, length_mm = True, 0.5, (0.0, 0.0), (50.0, 50.0), {length}
+    def __call__(self, time_s, actuation):
+        bend = (np.asarray(actuation)[:, :1] - np.asarray(actuation)[:, 1:]) / 50.0 + 1e-9
+        share, size = np.linspace(0.0, 1.0, 4)[None, {points}], {body}
+        x, z = (1.0 - np.cos(bend * share)) / bend, np.sin(bend * share) / bend
+        return size * np.stack((x, 0.0 * x, z - {lowered}), axis=-1)
+arm = Arm()
+"""
+"""An arc of `body` units of length, whose model states `length` mm; lowered: 1 with the origin at
+the tip at rest."""
+
+
+@pytest.mark.parametrize("task", ["track_circle", "laser_plane", "circle_ablation"])
+@pytest.mark.parametrize(
+    ("length", "body", "points", "message"),
+    [
+        (70.0, 0.07, ":", "in m: along the body, base to tip, they are 0.07 long, where the arm"),
+        (70.0, 7.0, ":", "in cm: along the body, base to tip, they are 7 long, where the arm is 7"),
+        (None, 0.07, ":", "in m: along the body, base to tip, they are 0.07 long, where an arm is"),
+        (70.0, 0.07, "3:", "in m: along the body, base to tip, they are 0.07 long, where the arm"),
+    ],
+)
+def test_an_own_arm_in_another_unit_of_length_is_refused(
+    tmp_path, task, length, body, points, message
+):
+    file = tmp_path / "own.py"
+    file.write_text(OWN_ARM.format(length=length, body=body, points=points, lowered=0))
+    told = refusal(lambda: make_with(task, arm=f"{file}:arm"))
+    assert f"own.py:arm: returns key points {message}" in told
+    assert f"expected mm: multiply them by {10 if body == 7.0 else 1000}" in told
+
+
+def test_an_arm_in_mm_with_its_only_origin_at_the_tip_is_taken(tmp_path):
+    """The distance of the tip from the origin is then no length: 0 at rest."""
+    file = tmp_path / "own.py"
+    file.write_text(OWN_ARM.format(length=70.0, body=70.0, points="3:", lowered=1))
+    task = make_with("track_body", arm=f"{file}:arm")
+    rest = task.world.arms["arm"].model.rest_mm
+    np.testing.assert_allclose(rest, np.zeros((1, 3)), atol=1e-4)
+
+
 def test_a_weight_that_is_no_number_is_named():
     config = config_of("track_circle")
     wrong = FollowWeights(track=float("nan"))

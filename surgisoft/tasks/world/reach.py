@@ -24,17 +24,11 @@ from surgisoft.surrogate.callables.named import is_callable_name
 from surgisoft.surrogate.callables.network import CallableNetwork
 from surgisoft.surrogate.checkpoint import default_arm, load_model
 from surgisoft.surrogate.model import ArmModel
-from surgisoft.surrogate.reach import grid_axes, model_table
+from surgisoft.surrogate.reach import grid_axes, model_table, require_millimetres
 from surgisoft.tasks.world.scene import SceneEngineConfig
-from surgisoft.units import MM_PER
 
 SAME_LENGTH_MM = 1.0
 """A mount's length may differ by this from its model's (mm)."""
-LEAST_BODY_MM = 3.0
-"""A body below this length, at rest, is in another unit than mm: no arm with a tool is so short."""
-SAME_LENGTH = 1.5
-"""Ratio up to which the body of a model has the length that the model states, once a wrong unit is
-corrected: an arm that stretches is longer than at rest."""
 
 
 def reach_of(mount: MountSpec, folder: Path | None = None, where: Where | None = None) -> ArmReach:
@@ -46,8 +40,8 @@ def reach_of(mount: MountSpec, folder: Path | None = None, where: Where | None =
     where: the mount's place in the scene file, for the error.
     """
     place = _model_folder(mount, folder, where)
-    (axes, lines, directions), spec = _default_table() if place is None else _table(place)
-    _check_millimetres(mount.arm, lines, spec)
+    table = _default_table() if place is None else _table(place, mount.arm)
+    (axes, lines, directions), spec = table
     _check_length(mount, spec, where)
     return ArmReach(axes, lines, directions, np.array(spec.rest), 0.5 * mount.diameter_mm)
 
@@ -177,30 +171,6 @@ def _model_folder(mount: MountSpec, folder: Path | None, where: Where | None) ->
     return found
 
 
-def _check_millimetres(model: str, lines_mm: np.ndarray, spec: ArmSpec) -> None:
-    """Raise where the centrelines (N, K, 3) of a model are in another unit of length than mm.
-
-    They are where a unit brings their length to the one that the model states, or where they are
-    too short for an arm: then metres or another unit stand for mm in both.
-    """
-    body = float(np.median(np.linalg.norm(np.diff(lines_mm, axis=1), axis=-1).sum(axis=1)))
-    came = f"{model}: returns key points in {{}}: along the body, base to tip, they are {body:.3g}"
-    advice = "expected mm: multiply them by {:g}"
-    for unit, by in MM_PER.items():
-        stated = spec.length_mm
-        if by > 1.0 and stated and abs(np.log(by * body / stated)) < np.log(SAME_LENGTH):
-            raise InputError(
-                f"{came.format(unit)} long, where the arm is {stated:.4g} mm long; "
-                f"{advice.format(by)}"
-            )
-    if body < LEAST_BODY_MM:
-        unit = "m" if body < 1.0 else "cm"
-        raise InputError(
-            f"{came.format(unit)} long, where an arm is {LEAST_BODY_MM:g} mm long or more; "
-            f"{advice.format(MM_PER[unit])}, and so its length_mm"
-        )
-
-
 def _check_length(mount: MountSpec, spec: ArmSpec, where: Where | None) -> None:
     """Raise unless the mount states the length of its model."""
     if spec.length_mm is not None and abs(spec.length_mm - mount.length_mm) > SAME_LENGTH_MM:
@@ -216,9 +186,10 @@ def _error(
     return (where / field).error(came, expected)
 
 
-def _table(folder: Path | str) -> tuple:
-    """`model_table` of the model in a folder, and the model's spec."""
+def _table(folder: Path, name: str) -> tuple:
+    """`model_table` of the model in a folder, and the model's spec; name: what the scene says."""
     model = load_model(folder)
+    require_millimetres(model, name)
     return model_table(model), model.spec
 
 

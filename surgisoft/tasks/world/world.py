@@ -26,6 +26,7 @@ from surgisoft.scene.spec import MountSpec
 from surgisoft.surrogate.backbone import TIP_TASKS
 from surgisoft.surrogate.checkpoint import default_arm, load_model
 from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.reach import require_millimetres
 from surgisoft.tasks.world.arm import (
     Arm,
     ArmPart,
@@ -414,8 +415,13 @@ def _check_length(model: ArmModel, mount: MountSpec, scene: Scene, arm: str | Pa
 def named_arm(
     name: str | Path, device: str | torch.device = "cpu", folder: str | Path = "."
 ) -> ArmModel:
-    """Load `default`, or the fitted model in a folder, relative to `folder` or as it is."""
+    """Load `default`, or the fitted model in a folder, relative to `folder` or as it is.
+
+    Raises InputError where its key points are not in mm.
+    """
     if str(name) == "default":
         return default_arm(device)
     places = (Path(folder) / name, Path(name))
-    return load_model(next((place for place in places if place.is_dir()), Path(name)), device)
+    model = load_model(next((place for place in places if place.is_dir()), Path(name)), device)
+    require_millimetres(model, str(name))
+    return model

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
 import math
@@ -152,6 +153,11 @@ def _check_vary(spec: Experiment, vary: Vary, place: Where) -> None:
             try:
                 configured(spec, ((vary.field, value),))
             except InputError as error:
+                if not isinstance(value, tuple) and (example := _list_for(spec, vary)):
+                    raise (place / "values").error(
+                        f"got {value!r}, where a value of {vary.field} is a list of numbers",
+                        f"each value as a list itself, such as values = [{example}, ...]",
+                    ) from None
                 raise (place / "values" / i).error(
                     f"{error}", "a value that the task takes"
                 ) from None
@@ -187,13 +193,31 @@ def _check_vary(spec: Experiment, vary: Vary, place: Where) -> None:
         )
 
 
+def _list_for(spec: Experiment, vary: Vary) -> str:
+    """A list that the field takes as one value: all that are given, or that of the task; in words.
+
+    Empty for a field that takes none.
+    """
+    present: Any = to_table(spec.task)
+    for part in vary.field.split(".")[1:]:
+        present = present.get(part) if isinstance(present, dict) else None
+    for value in (vary.values, present):
+        given = value if isinstance(value, tuple | list) else ()
+        numbers = tuple(each for each in given if isinstance(each, int | float))
+        if numbers and len(numbers) == len(given):
+            with contextlib.suppress(InputError):
+                configured(spec, ((vary.field, numbers),))
+                return in_words(numbers)
+    return ""
+
+
 def configured(spec: Experiment, values) -> Any:
     """The task's configuration with pairs (field, value) of what varies; not yet in a scene."""
     table = to_table(spec.task)
     for field, value in values:
         top, _, name = field.partition(".")
         if top == "task":
-            change: dict | Value = value
+            change: Any = list(value) if isinstance(value, tuple) else value
             for part in reversed(name.split(".")):
                 change = {part: change}
             table = merged(table, with_present_names(spec.task, change))

@@ -35,7 +35,7 @@ from surgisoft.tasks.circle_ablation import CircleAblation
 from surgisoft.tasks.laser_supervision import LaserSupervision
 from surgisoft.tasks.observations import TIME
 from surgisoft.tasks.registry import with_fields
-from tests.experiments.tiny import FAULT, TINY, write
+from tests.experiments.tiny import BREATHING, FAULT, TINY, write
 from tests.rig.own_rig import OwnRig
 from tests.tasks.test_episode import made_up
 
@@ -61,6 +61,24 @@ def spec_of(folder, text: str = TINY):
 def test_values_that_cannot_vary_are_named(field, values, message, tmp_path):
     path = write(tmp_path, TINY + FAULT + VARY.format(field=field, values=values))
     with pytest.raises(InputError, match=re.escape(message)):
+        settings(load_experiment(path), read_toml(path)[1])
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ("2.0, 10.0", "got 2.0, where a value of {} is a list of numbers; expected each value as a"),
+        ("2.0, 10.0", "as a list itself, such as values = [[2, 10], ...]"),
+        ("2.0, 3.0, 4.0", "as a list itself, such as values = [[5, 20], ...]"),
+        ("[2.0, 10.0], 4.0", "got 4.0, where a value of {} is a list of numbers"),
+        ("[2.0, 10.0], [4.0]", "values[1]: {}: got a list [4.0]; expected 2 numbers"),
+    ],
+)
+def test_each_value_of_a_field_of_two_numbers_is_a_list(values, message, tmp_path):
+    """The three numbers fit no value of the field, so its own value is the example."""
+    field = "task.respiration.amplitude_mm"
+    path = write(tmp_path, BREATHING + VARY.format(field=field, values=values))
+    with pytest.raises(InputError, match=re.escape(message.format(field))):
         settings(load_experiment(path), read_toml(path)[1])
 
 

@@ -310,14 +310,23 @@ BESIDE = 0.12
 """Distance of the marks of two lines at the same value of such a field."""
 
 
-def sweep_chart(field: str, label: str, lines: Mapping[str, Sequence[tuple]]) -> Picture:
+WIDE_NAMES = 40
+"""Characters of the names of values side by side from which on they are drawn aslant."""
+ASLANT_DEG = 30.0
+"""Slope of such names (degrees)."""
+
+
+def sweep_chart(
+    field: str, label: str, lines: Mapping[str, Sequence[tuple]], names: Sequence[str] = ()
+) -> Picture:
     """A number over what varies, with 95 % intervals; lines: name -> (value, mean, low, high).
 
-    Between the values of `UNORDERED` fields no line is drawn.
+    names: those of values that are no numbers, such as lists; a value in `lines` is then the place
+    of its name. Between such values, and those of `UNORDERED` fields, no line is drawn.
     """
     colours = (BLUE, RED, GREEN, AMBER)
     name = field.split(".")[-1]
-    apart, most = name in UNORDERED, 0.0
+    apart, most = bool(names) or name in UNORDERED, 0.0
     known: set[float] = set()
     with drawing():
         figure, axis = plt.subplots()
@@ -334,7 +343,13 @@ def sweep_chart(field: str, label: str, lines: Mapping[str, Sequence[tuple]]) ->
                 continue
             axis.fill_between(x, low, high, color=colour, alpha=0.15, lw=0)
             axis.plot(x, mean, c=colour, marker="o", ms=4, label=title)
-        if apart:
+        if names:
+            axis.set_xlim(-0.5, len(names) - 0.5)
+            slope = ASLANT_DEG if sum(map(len, names)) > WIDE_NAMES else 0.0
+            axis.set_xticks(
+                range(len(names)), names, rotation=slope, ha="right" if slope else "center"
+            )
+        elif apart:
             axis.set_xticks(sorted(known))
         axis.set_ylim(0.0, 1.06 * most if most > 0.0 else 1.0)
         axis.ticklabel_format(axis="y", scilimits=PLAIN_POWERS, useOffset=False, useMathText=True)

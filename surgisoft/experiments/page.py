@@ -10,7 +10,7 @@ from surgisoft.agents.evaluate import WHAT_CELLS_ARE, cell, cells_are
 from surgisoft.agents.report import episode_parts
 from surgisoft.agents.report_charts import path_chart, spread_chart, sweep_chart
 from surgisoft.errors import counted
-from surgisoft.experiments.plan import configured
+from surgisoft.experiments.plan import configured, in_words
 from surgisoft.experiments.results import Results, SettingResult
 from surgisoft.experiments.spec import Experiment
 from surgisoft.report import Facts, Gallery, Page, Picture, Section, Share, Table, Text
@@ -312,13 +312,15 @@ def _spreads(results: Results) -> list[Picture]:
 
 
 def _sweeps(results: Results) -> list[Section]:
-    """A section for each number that varies: success and error over it."""
+    """A section for each field that varies: success and error over its values."""
     sections, known = [], _known(results)
     for vary in results.experiment.vary:
-        if len(vary.values) < 2 or any(isinstance(each, str | tuple) for each in vary.values):
+        if len(vary.values) < 2:
             continue
+        numbers = all(isinstance(each, int | float) for each in vary.values)
+        names = [] if numbers else [in_words(each) for each in vary.values]
         charts = [
-            sweep_chart(vary.field, known[name], _lines(results, vary.field, name))
+            sweep_chart(vary.field, known[name], _lines(results, vary.field, name, names), names)
             for name in results.experiment.of.experiment.swept
             if name in known
         ]
@@ -326,11 +328,15 @@ def _sweeps(results: Results) -> list[Section]:
     return sections
 
 
-def _lines(results: Results, field: str, name: str) -> dict[str, list[tuple]]:
-    """Case and the other values -> (value, mean, low, high) of a number, rising."""
+def _lines(results: Results, field: str, name: str, names: Sequence[str]) -> dict[str, list[tuple]]:
+    """Case and the other values -> (value, mean, low, high) of a number, rising.
+
+    names: the values in words where they are no numbers; the place in them is then the value.
+    """
     lines: dict[str, list[tuple]] = {}
     for setting in results.settings:
-        if setting.values[field] is None:
+        value = setting.values[field]
+        if value is None:
             continue
         others = [
             f"{k.split('.')[-1]} {v}"
@@ -338,7 +344,8 @@ def _lines(results: Results, field: str, name: str) -> dict[str, list[tuple]]:
             if k != field and v is not None
         ]
         found = setting.overall[name]
-        point = (setting.values[field], found.mean, found.low, found.high)
+        place = names.index(in_words(value)) if names else value
+        point = (place, found.mean, found.low, found.high)
         lines.setdefault(", ".join([setting.case, *others]), []).append(point)
     return {key: sorted(points) for key, points in lines.items()}
 

@@ -67,7 +67,10 @@ def test_values_that_cannot_vary_are_named(field, values, message, tmp_path):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ("2.0, 10.0", "got 2.0, where a value of {} is a list of numbers; expected each value as a"),
+        (
+            "2.0, 10.0",
+            "got 2.0, where a value of {} is a list of numbers; expected each value as a",
+        ),
         ("2.0, 10.0", "as a list itself, such as values = [[2, 10], ...]"),
         ("2.0, 3.0, 4.0", "as a list itself, such as values = [[5, 20], ...]"),
         ("[2.0, 10.0], 4.0", "got 4.0, where a value of {} is a list of numbers"),

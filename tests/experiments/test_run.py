@@ -22,13 +22,13 @@ from surgisoft.cli import run
 from surgisoft.errors import InputError
 from surgisoft.experiments import run as experiment_run
 from surgisoft.experiments import spec as experiment_spec
-from surgisoft.experiments.page import rules, verdict
+from surgisoft.experiments.page import experiment_page, rules, verdict
 from surgisoft.experiments.plan import build_task, settings
 from surgisoft.experiments.results import drop_logs, sum_up
 from surgisoft.experiments.run import open_results, run_experiment
 from surgisoft.experiments.session import ExperimentRules, with_policy
 from surgisoft.experiments.spec import Case, load_experiment
-from surgisoft.report import Picture
+from surgisoft.report import Picture, Section
 from surgisoft.scene.spec import PHANTOM
 from surgisoft.tasks.circle_ablation import CircleAblationConfig, success_rule
 from surgisoft.tasks.registry import spec_of
@@ -505,6 +505,39 @@ def test_the_verdict_of_a_burn_on_a_moving_organ_is_its_error_on_the_tissue(tmp_
     said = "'gated': success 2 of 2, mean error on the tissue 0.2 mm."
     assert verdict(results).startswith(said)
     assert results.worst == ("gated", 1)
+
+
+def test_lists_that_vary_have_a_chart_with_their_values_at_the_axis(tmp_path, monkeypatch):
+    """Of five settings, of which the report shows no first episodes side by side."""
+    amplitudes = [[10, 20], [2.5, 5], [4, 4], [1, 2], [3, 30]]
+    vary = f'\n[[vary]]\nfield = "task.respiration.amplitude_mm"\nvalues = {amplitudes}\n'
+    spec = load_experiment(write(tmp_path, BREATHING + vary))
+    same = {"case": "simulation", "episode": 0, "outcome": "done", "success": 1.0}
+    same |= {"completion": 1.0, "time_s": 9.0, "beam_unsafe_longest_s": 0.0}
+    same |= {"beam_error_mean_mm": 0.1}
+    errors = [0.5, 0.2, 0.3, 0.1, 0.4]
+    rows = [
+        {**same, **setting.columns, "setting": setting.label, "tissue_error_mean_mm": error}
+        for setting, error in zip(settings(spec), errors, strict=True)
+    ]
+    drawn = {}
+
+    def keep(figure, alt, caption="", least_px=0):
+        drawn[alt] = figure.axes[0]
+        plt.close(figure)
+        return Picture(b"<svg/>", alt, caption, "image/svg+xml", least_px)
+
+    monkeypatch.setattr(report_charts, "chart", keep)
+    page = experiment_page(sum_up(spec, tmp_path, rows), {}, {}, "")
+    assert "Over task.respiration.amplitude_mm" in [
+        part.title for part in page.parts if isinstance(part, Section)
+    ]
+    title = spec.of.experiment.numbers["tissue_error_mean_mm"]
+    axis = drawn[f"{title} over amplitude_mm"]
+    named = [label.get_text() for label in axis.get_xticklabels()]
+    assert named == ["[10, 20]", "[2.5, 5]", "[4, 4]", "[1, 2]", "[3, 30]"]
+    (marks,) = (line for line in axis.lines if line.get_marker() == "o")
+    assert dict(zip(marks.get_xdata(), marks.get_ydata(), strict=True)) == dict(enumerate(errors))
 
 
 def test_the_rule_of_success_has_the_values_of_all_settings(tmp_path):

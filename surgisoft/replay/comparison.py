@@ -173,7 +173,7 @@ def write_change(
             Line("/plots/change/explained", "explained", explained[:, -1] @ along, PLAN_COLOUR),
         ],
         "Change of each key point (mm)": [
-            Line(f"/plots/size/k{i}", f"k{i}", size[:, i], series_colour(i))
+            Line(f"/plots/size/k{i}", f"k{i}", size[:, i], series_colour(i), keeps="Max")
             for i in range(size.shape[1])
         ],
     }
@@ -227,15 +227,15 @@ def _lines(errors: Mapping[str, np.ndarray], pressure, unit: str) -> dict[str, l
     groups = {}
     if len(errors) > 1:
         groups["Error of the tip (mm)"] = [
-            Line(f"/plots/tip/model{i}", label, error[:, -1], rgb(model_colour(i - 1)))
+            Line(f"/plots/tip/model{i}", label, error[:, -1], rgb(model_colour(i - 1)), keeps="Max")
             for i, (label, error) in enumerate(errors.items(), 1)
         ]
     for number, (label, error) in enumerate(errors.items(), 1):
         of = f", {label}" if len(errors) > 1 else ""
         where = f"/plots/error/model{number}"
         groups[f"Error of each key point (mm){of}"] = [
-            Line(f"{where}/k{i}", f"k{i}{_end_of_arm(i, error.shape[1])}", values, series_colour(i))
-            for i, values in enumerate(error.T)
+            Line(f"{where}/k{i}", name, values, series_colour(i), keeps="Max")
+            for i, (name, values) in enumerate(zip(_names(error.shape[1]), error.T, strict=True))
         ]
     if pressure is not None:
         what = actuation_word(unit)
@@ -247,10 +247,10 @@ def _lines(errors: Mapping[str, np.ndarray], pressure, unit: str) -> dict[str, l
     return groups
 
 
-def _end_of_arm(number: int, count: int) -> str:
-    if count == 1:
-        return ""
-    return {0: " (base)", count - 1: " (tip)"}.get(number, "")
+def _names(count: int) -> list[str]:
+    """Names of `count` key points; of several, the ends of the arm are told."""
+    ends = {0: " (base)", count - 1: " (tip)"} if count > 1 else {}
+    return [f"k{i}{ends.get(i, '')}" for i in range(count)]
 
 
 def _break_at_pauses(columns: Columns, entity: str) -> None:

@@ -32,7 +32,7 @@ from surgisoft.replay.colours import (
     paler,
     series_colour,
 )
-from surgisoft.replay.plots import Corner, last_seconds, time_axis
+from surgisoft.replay.plots import Corner, Kept, last_seconds, time_axis
 from surgisoft.replay.recording import LEGEND, SUFFIX, TIME
 from surgisoft.replay.shapes import finer
 from surgisoft.replay.viewer import (
@@ -136,10 +136,10 @@ class LiveView:
         self._lines("pressure/sent", names, [paler(colour) for colour in colours], 1.0)
         self._lines("pressure/measured", [f"chamber {i + 1}" for i in chambers], colours)
         colours = [series_colour(i) for i in points]
-        self._lines("residual/key_points", [f"k{i}" for i in points], colours)
-        self._lines("alarm/level", ["alarm level"], [REAL_COLOUR])
+        self._lines("residual/key_points", [f"k{i}" for i in points], colours, keeps="Max")
+        self._lines("alarm/level", ["alarm level"], [REAL_COLOUR], keeps="Max")
         self._lines("alarm/threshold", ["alarm"], [LIMIT_COLOUR], 1.0)
-        self._lines("tracking/error", ["error"], [PLAN_COLOUR])
+        self._lines("tracking/error", ["error"], [PLAN_COLOUR], keeps="Max")
         text = rr.TextDocument(bench.legend, media_type="text/markdown")
         recording.log(LEGEND, text, static=True)
 
@@ -205,8 +205,21 @@ class LiveView:
             begin = f"{'':10}" if number else f"{t_s:6.1f} s  "
             self.recording.log(EVENTS, rr.TextLog(begin + line, level=level))
 
-    def _lines(self, place: str, names: list[str], colours: list, width: float = 1.6) -> None:
-        style = rr.SeriesLines(names=names, colors=colours, widths=[width] * len(names))
+    def _lines(
+        self,
+        place: str,
+        names: list[str],
+        colours: list,
+        width: float = 1.6,
+        keeps: Kept = "Average",
+    ) -> None:
+        """Log the style of a plot's lines; keeps: what is drawn of samples in one column."""
+        style = rr.SeriesLines(
+            names=names,
+            colors=colours,
+            widths=[width] * len(names),
+            aggregation_policy=keeps,
+        )
         self.recording.log(f"/plots/{place}", style, static=True)
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import rerun.blueprint as rrb
+from rerun.components import AggregationPolicy
 
 from surgisoft.error_scale import bar_length, error_scale
 from surgisoft.errors import InputError
@@ -47,6 +48,21 @@ def test_errors_are_arrows_from_measured_to_predicted(tmp_path):
     bodies = column(replay.path, "/measured/body", "LineStrips3D:strips")
     assert sorted(set(range(50)) - set(bodies)) == [7, 9]
     np.testing.assert_allclose(np.array(bodies[0][0])[[0, -1]], measured[0][[0, -1]], atol=1e-4)
+
+
+def test_peaks_of_errors_and_changes_stay_in_sight(tmp_path):
+    """Where several rows share a column of pixels, the viewer would draw their mean."""
+    t_s, measured, predicted = made_up()
+    path = tmp_path / "c.rrd"
+    write_comparison(t_s, measured, {"a": predicted, "b": measured}, "x", path, np.ones((50, 1)))
+    most, mean = [AggregationPolicy.Max.value], [AggregationPolicy.Average.value]
+    for entity, kept in (("error/model2/k3", most), ("tip/model1", most), ("pressure/p1", mean)):
+        held = column(path, f"/plots/{entity}", "SeriesLines:aggregation_policy")
+        assert held == {-1: kept}, entity
+    write_change(t_s, measured, predicted, predicted - measured, "x", path)
+    for entity, kept in (("size/k2", most), ("change/measured", mean)):
+        held = column(path, f"/plots/{entity}", "SeriesLines:aggregation_policy")
+        assert held == {-1: kept}, entity
 
 
 def test_an_explained_change_is_drawn_to_the_scale_of_the_measured_one(tmp_path):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from rerun.components import AggregationPolicy
 
 from surgisoft.replay.live_view import LiveBench, live_blueprint, live_view
 from surgisoft.viewpoint import upright
@@ -18,6 +19,19 @@ def test_lines_end_where_the_arm_rests_between_two_runs(tmp_path):
         broken = {round(t * 1e-9, 6): len(v) for t, v in held.items() if np.isnan(v).all()}
         assert broken == {1.001: count}, entity
         assert len([t for t in held if t >= 0]) == 5 + 1, "and every sample"
+
+
+def test_peaks_of_errors_and_of_the_alarm_level_stay_in_sight(tmp_path):
+    """Where several samples share a column of pixels, the viewer would draw their mean."""
+    points = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 60.0]])
+    with live_view(LiveBench(3, 2, "kPa", 70.0, "a bench", True), file=tmp_path / "a.rrd") as view:
+        view.sample(0.0, points, points + 0.1, np.ones(3), np.ones(3), 0.2)
+    kept = {
+        place: column(tmp_path / "a.rrd", f"/plots/{place}", "SeriesLines:aggregation_policy")[-1]
+        for place in ("residual/key_points", "alarm/level", "tracking/error", "pressure/measured")
+    }
+    most, mean = AggregationPolicy.Max.value, AggregationPolicy.Average.value
+    assert list(kept.values()) == [[most], [most], [most], [mean]]
 
 
 @pytest.mark.parametrize(

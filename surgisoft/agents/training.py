@@ -24,11 +24,11 @@ from rsl_rl.algorithms import PPO
 from torch import Tensor
 
 from surgisoft.agents.actor import ScaledActor
-from surgisoft.agents.compiled_update import CompileFailed, compile_arms
+from surgisoft.agents.compiled_update import compile_arms
 from surgisoft.agents.distributed import Processes
 from surgisoft.agents.graphed_rollout import rollouts
 from surgisoft.agents.learned import ActorPolicy, agent_sizes, check_weights
-from surgisoft.agents.loggers import TENSORBOARD, LoggerFailed, open_writer
+from surgisoft.agents.loggers import TENSORBOARD, open_writer
 from surgisoft.agents.policy_network import acting
 from surgisoft.agents.ppo import RolloutMeans, make_ppo, set_noise, update
 from surgisoft.agents.presets import Plan
@@ -321,17 +321,22 @@ def train_new(
     report: Callable[[TrainingProgress], None] = lambda progress: None,
     logger: str = TENSORBOARD,
 ) -> Result:
-    """Train a new run; its folder is complete before training begins."""
+    """Train a new run; its folder is complete before training begins.
+
+    Where training raises before there is a checkpoint, nothing was learned, and no folder is left.
+    """
     task = make_task(plan.task, plan.task_config, device)
     if processes.leads:
         create_run(folder, plan, task, agent_sizes(task), processes.count)
     processes.wait()
     # Everything is read back from the folder, so that resuming finds the same.
+    run = RunFolder(folder)
     try:
-        return _continue(RunFolder(folder), processes, device, report, logger)
-    except (LoggerFailed, CompileFailed):  # before an update: nothing is lost with the folder
-        if processes.leads:
-            shutil.rmtree(folder)
+        return _continue(run, processes, device, report, logger)
+    except (Exception, SystemExit):  # also those of code of the user's
+        if processes.leads and not any(run.checkpoint(each).is_file() for each in (LAST, BEST)):
+            with suppress(OSError):
+                shutil.rmtree(folder)
         raise
 
 

@@ -163,6 +163,7 @@ def test_a_training_names_the_reward_term_that_is_nan(installed, tmp_path, monke
     told = capsys.readouterr().err
     assert "reward term 'smooth' of 'arm' is NaN or infinite within the first 384 steps" in told
     assert "correct the rewards of the task 'smooth_circle'" in told
+    assert not Path("own").exists(), "nothing was learned"
 
 
 def test_what_a_package_offers_is_checked(installed):
@@ -225,6 +226,7 @@ FAULTY = {
     "run scripted --task build -o x": "task 'build': raised KeyError in faulty.py line 6: 'gain'",
     "evaluate scripted --task none": "task 'none': what builds it returns a NoneType, expected a",
     "evaluate scripted --task late --episodes 1": "raised RuntimeError in faulty.py line 11: no su",
+    "train --task late --steps 512 --envs 32 -o x": "raised RuntimeError in faulty.py line 11: no",
     "train --task own price=-1.0 -o x": "raised AssertionError in faulty.py line 18: a price of 0",
     "train --task raising -o x": "does not load (ZeroDivisionError in raising.py line 2: division",
     "train --task unfinished -o x": "does not load (SyntaxError in unfinished.py line 3: invalid",

@@ -47,7 +47,6 @@ from surgisoft.errors import InputError
 from surgisoft.measurement.histories import history_of, speed_of
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import Recording, load_recording, save_recording
-from surgisoft.report import charts
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, save_model
 from surgisoft.surrogate.model import Validation
@@ -663,7 +662,7 @@ def drawn(found) -> tuple[list[str], str]:
     """Labels of the lines in the chart of the effects, and of what is explained of the change."""
     figures = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(charts, "chart", lambda figure, *_: figures.append(figure))
+        patch.setattr(page, "chart", lambda figure, *_: figures.append(figure))
         page.effects_chart(found)
         if found.track is not None:
             page.change_chart(found.track, page.explained_by(found))

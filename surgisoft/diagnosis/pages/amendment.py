@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib import pyplot as plt
 
 from surgisoft.diagnosis.amend import Amendment, Fall, Track, errs_more
 from surgisoft.diagnosis.diagnose import Diagnosis
@@ -160,8 +161,6 @@ def track_charts(tracks: dict[str, Track], floor_mm: float) -> list[Picture]:
 
     A track is the error of both models over time; runs and recordings stand one after another.
     """
-    from matplotlib import pyplot as plt
-
     thinned = {caption: _thinned(track) for caption, track in tracks.items()}
     most = max(float(np.nanmax([before, after])) for _, before, after in thinned.values())
     pictures = []
@@ -455,8 +454,6 @@ CAPTION = "Error on the held-out part after each step; dashed: noise floor of th
 
 def waterfall(before_mm: float, steps: list[tuple[str, float]], floor_mm: float):
     """A Matplotlib figure; steps: (name, error after it in mm). Draw inside `drawing`."""
-    from matplotlib import pyplot as plt
-
     figure, axis = plt.subplots(figsize=(1.6 + 1.1 * (len(steps) + 2), 3.2))
     axis.bar(0, before_mm, color=RED, width=0.7)
     level, place, names = before_mm, 0, ["before"]
@@ -492,8 +489,6 @@ def write_waterfall(
     before_mm: float, steps: list[tuple[str, float]], floor_mm: float, path: Path
 ) -> Path:
     """The waterfall as a PNG on white."""
-    from matplotlib import pyplot as plt
-
     with drawing(), new_file(path) as fresh:
         figure = waterfall(before_mm, steps, floor_mm)
         figure.savefig(fresh, dpi=160, facecolor="white")

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from matplotlib import pyplot as plt
 
 from surgisoft.diagnosis.body_frame import COMPONENTS
 from surgisoft.diagnosis.compare import Compared, Comparison
@@ -236,8 +237,6 @@ def share_chart(share: AxisShare, floor_mm: float | None) -> Picture:
 
     The upper panel is over the column that explains most. Draw inside `drawing`.
     """
-    from matplotlib import pyplot as plt
-
     profiles, many = share.profiles, len(share.profiles) > 1
     most = max(range(len(profiles)), key=lambda k: _won(profiles[k]))
     main = profiles[most]
@@ -283,8 +282,6 @@ def _of_chamber(profile: Profile) -> str:
 
 def _chart(result: Comparison, axis: str, unit: str) -> Picture:
     """Chart of RMSE (above) and bias (below) over an axis; 95 % intervals are shaded."""
-    from matplotlib import pyplot as plt
-
     found = columns_of(result, axis)
     figure, (top, low) = plt.subplots(2, 1, figsize=(CHART[0], 1.35 * CHART[1]), sharex=True)
     for (title, bands), colour in zip(found.items(), COLOURS * len(found), strict=False):
@@ -424,8 +421,6 @@ def _telling(compared: Sequence[Compared]) -> list[str]:
 
 
 def _models_over_time(compared: Sequence[Compared]) -> Picture:
-    from matplotlib import pyplot as plt
-
     figure, axis = plt.subplots(figsize=(9.2, 3.2))
     for number, one in enumerate(compared):
         time_s, values = thinned(one.table)
@@ -455,8 +450,6 @@ def thinned(table: ResidualTable, points: int = POINTS) -> tuple[np.ndarray, np.
 
 
 def _models_along(compared: Sequence[Compared]) -> Picture:
-    from matplotlib import pyplot as plt
-
     figure, axis = plt.subplots(figsize=CHART)
     for number, one in enumerate(compared):
         where = arc_length(one.table)
@@ -472,8 +465,6 @@ def _models_along(compared: Sequence[Compared]) -> Picture:
 
 def _models_over(compared: Sequence[Compared], name: str) -> Picture:
     """The error of each model over the column of an axis on which the first one varies most."""
-    from matplotlib import pyplot as plt
-
     first = columns_of(compared[0].result, name)
     column = max(first, key=lambda title: float(np.ptp([band.rmse_mm for band in first[title]])))
     unit = AXES[name].unit.format(unit=compared[0].table.spec.unit)

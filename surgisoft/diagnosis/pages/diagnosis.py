@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from matplotlib import pyplot as plt
 
 from surgisoft.diagnosis.decision import Probabilities
 from surgisoft.diagnosis.diagnose import LOCAL, Diagnosis
@@ -11,6 +12,7 @@ from surgisoft.diagnosis.refit import Refit
 from surgisoft.diagnosis.residuals import floor_in_words
 from surgisoft.diagnosis.setup import SetupFault, SetupResult
 from surgisoft.report import Command, Facts, Page, Part, Section, Share, Table, Text, write_page
+from surgisoft.report.charts import AMBER, BLUE, BROAD, BROAD_PX, GREEN, RED, chart, drawing
 from surgisoft.report.style import MUTED
 
 HOW = (
@@ -173,18 +175,6 @@ def change_chart(track: ChangeTrack, name: str):
 
     name: what the explained change is explained by.
     """
-    from surgisoft.report.charts import (
-        AMBER,
-        BLUE,
-        BROAD,
-        BROAD_PX,
-        GREEN,
-        RED,
-        chart,
-        drawing,
-        plt,
-    )
-
     rows = worst_stretch(track)
     change = track.change_mm[rows, -1]
     along = np.linalg.svd(np.nan_to_num(change), full_matrices=False)[2][0]
@@ -345,18 +335,6 @@ def _number(value) -> str:
 
 def effects_chart(found: Diagnosis):
     """Held-out error with each effect, between the noise floor and what is left without any."""
-    from surgisoft.report.charts import (
-        AMBER,
-        BLUE,
-        BROAD,
-        BROAD_PX,
-        GREEN,
-        RED,
-        chart,
-        drawing,
-        plt,
-    )
-
     rows = found.shown[::-1]
     error, paired = found.error_mm, found.track is not None
     what, blocks = "change" if paired else "error", "left-out" if found.in_fit else "held-out"
@@ -383,18 +361,6 @@ def effects_chart(found: Diagnosis):
 
 def along_chart(found: Diagnosis):
     """Error, or change, of each block of time; the worst one marked where the error is local."""
-    from surgisoft.report.charts import (
-        AMBER,
-        BLUE,
-        BROAD,
-        BROAD_PX,
-        GREEN,
-        RED,
-        chart,
-        drawing,
-        plt,
-    )
-
     along, paired = found.along, found.track is not None
     assert along is not None
     what = "change" if paired else "error"

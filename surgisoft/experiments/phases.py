@@ -12,8 +12,8 @@ from torch import Tensor
 
 from surgisoft.errors import InputError
 from surgisoft.experiments.spec import Experiment
-from surgisoft.tasks.base import TaskState
-from surgisoft.tasks.episodes.log import DONE, EARLY, EpisodeLog
+from surgisoft.tasks.base import DONE, TaskState
+from surgisoft.tasks.episodes.log import EARLY, EpisodeLog
 from surgisoft.tasks.episodes.parts import Event
 from surgisoft.tasks.registry import MOST_STEPS
 from surgisoft.tasks.supervision import Supervision

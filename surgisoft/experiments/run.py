@@ -54,9 +54,10 @@ from surgisoft.rig.registry import check_rig, may_be_real
 from surgisoft.scene.folder import open_scene
 from surgisoft.surrogate.checkpoint import content_hash
 from surgisoft.surrogate.code import name_code, named_code
+from surgisoft.tasks.base import DONE, TIME_OUT
 from surgisoft.tasks.episodes.file import save_episode
 from surgisoft.tasks.episodes.log import EpisodeLog
-from surgisoft.tasks.supervision import DONE, TIME_OUT, Row
+from surgisoft.tasks.supervision import Row
 from surgisoft.workers import CLUSTER, check_processes, torch_threads, workers
 
 POLICY = "policy"

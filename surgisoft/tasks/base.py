@@ -21,6 +21,8 @@ from surgisoft.threads import rows_on_threads
 
 Goal = TypeVar("Goal", bound=TensorDataclass)
 """Type of a task's goal, the part of its state that is not the world: a dataclass of tensors."""
+DONE, TIME_OUT = "done", "time out"
+"""How episodes end that went to their end: as they should, or by their time."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,13 +16,11 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import Task, TaskState
+from surgisoft.tasks.base import DONE, TIME_OUT, Task, TaskState
 from surgisoft.tasks.inverse_kinematics import Pointing
 
 MEAN_MM = "_mean_mm"
 """End of the name of an episode's mean error."""
-DONE, TIME_OUT = "done", "time out"
-"""Beginnings of the outcomes of episodes that went to their end."""
 Row = dict[str, Any]
 """One episode's results: name -> number or text; None where a number does not apply."""
 

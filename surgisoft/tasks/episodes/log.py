@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from torch import Tensor
 
-from surgisoft.tasks.base import Outcome, Task, TaskState
+from surgisoft.tasks.base import DONE, TIME_OUT, Outcome, Task, TaskState
 from surgisoft.tasks.episodes.parts import (
     ArmLog,
     BeamLog,
@@ -26,8 +26,6 @@ from surgisoft.tasks.world.arm import radius_mm
 from surgisoft.tasks.world.respiration import MOVING
 from surgisoft.tasks.world.scene import ObstacleEngine, SceneEngine
 
-DONE = "done"
-"""Event at the end of an episode that went as it should."""
 EARLY = "ended early"
 """Event at the end of an episode that ended before its time without success."""
 JUMP_MM = 3.0
@@ -218,7 +216,7 @@ class EpisodeRecorder:
         if bool(self._of(state.world.failed)):
             self._ending = "failed"
         elif self.done:
-            self._ending = "ended" if bool(self._of(outcome.terminated)) else "time out"
+            self._ending = "ended" if bool(self._of(outcome.terminated)) else TIME_OUT
 
     def log(self) -> EpisodeLog:
         """The episode so far."""
@@ -458,4 +456,4 @@ def _end(log: EpisodeLog, ending: str) -> tuple[str, str]:
     success = log.measures.get("success")
     if success is None or success[-1] > 0.0:
         return "info", DONE
-    return ("warning", "the time has elapsed") if ending == "time out" else ("error", EARLY)
+    return ("warning", "the time has elapsed") if ending == TIME_OUT else ("error", EARLY)

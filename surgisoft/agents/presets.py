@@ -31,8 +31,8 @@ Share = Annotated[float, Rule("a number from 0 to 1", lambda value: 0.0 <= value
 Widths = Annotated[
     tuple[int, ...],
     Rule(
-        "at most 100 widths from 1 to 10,000",
-        lambda widths: len(widths) <= 100 and all(1 <= width <= 10_000 for width in widths),
+        "a list of 1 to 100 widths from 1 to 10,000",
+        lambda widths: 1 <= len(widths) <= 100 and all(1 <= width <= 10_000 for width in widths),
     ),
 ]
 Episodes = Annotated[

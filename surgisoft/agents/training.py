@@ -172,9 +172,20 @@ class Training:
             )
 
     def _diverged(self, agents: str) -> InputError:
-        """The error where weights are not finite: nothing is learned any more."""
+        """The error where weights are not finite: nothing is learned any more.
+
+        Observations of the last rollout that are NaN are its cause, else the size of the steps.
+        """
         preset = self.plan.preset
         steps = (self.iteration + 1) * preset.envs * preset.rollout * self.processes.count
+        for agent, ppo in self.agents.items():
+            seen = ppo.storage.observations[agent].isnan().any(-1)
+            if bad := int(seen.sum()):
+                return InputError(
+                    f"the training diverged within the first {steps:,} steps: the observation of "
+                    f"'{agent}' is NaN in {bad:,} of the last {seen.numel():,}; correct observe of "
+                    f"the task '{self.plan.task}'"
+                )
         return InputError(
             f"the training diverged: after {steps:,} steps the weights of {agents} are NaN or "
             f"infinite; train again with a smaller ppo.learning_rate (now {preset.learning_rate:g})"

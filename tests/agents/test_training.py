@@ -592,6 +592,14 @@ def test_the_better_checkpoint_is_kept():
     assert not is_better({"success": 0.5, "error_mm": float("nan")}, one)
 
 
+def test_without_success_and_error_the_larger_return_is_better():
+    one = {"passes": 3.0, "mean_return": -2.0}
+    assert is_better({"passes": 1.0, "mean_return": -1.0}, one)
+    assert not is_better({"passes": 9.0, "mean_return": -3.0}, one)
+    assert not is_better({"passes": 9.0, "mean_return": float("nan")}, one)
+    assert not is_better({"error_mm": 2.0, "mean_return": 9.0}, {"error_mm": 1.0})
+
+
 def test_an_evaluation_is_means_over_episodes_of_the_right_steps(monkeypatch):
     """Two episodes of three and two steps: an error counts in every step, success at the end, the
     least clearance and any contact."""

@@ -10,6 +10,7 @@ from surgisoft.config import POSITIVE, Rule, at_least, one_of
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.tasks.registry import spec_of
 from surgisoft.tasks.world.arm import Randomisation
+from surgisoft.tasks.world.images import ImageConfig
 from surgisoft.tasks.world.observer import AlphaBetaFilter
 from surgisoft.tasks.world.world import WorldConfig
 
@@ -210,6 +211,15 @@ def envs_for(name: str, task: str, steps: int) -> int:
     return envs
 
 
+def check_vectors(images: ImageConfig) -> None:
+    """Raise InputError where agents would observe images, of which this trainer learns nothing."""
+    if images.kinds:
+        raise InputError(
+            f"images is '{images.images}', but policies of this trainer see vectors only: "
+            "leave it empty, or train on surgisoft.batched_env"
+        )
+
+
 @dataclass(frozen=True)
 class Plan:
     """One training run."""
@@ -242,6 +252,8 @@ class Plan:
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise InputError(f"train: {name} is {value}, expected more than 0")
+        if (world := getattr(self.task_config, "world", None)) is not None:
+            check_vectors(world.endoscope_images)
 
     def whole_steps(self, processes: int = 1) -> int | None:
         """Steps that are trained: those of the plan, rounded up to whole updates of all processes;

@@ -28,6 +28,7 @@ ACTIVATIONS += ("softplus", "gelu", "swish", "mish", "identity")
 """Activations by rsl-rl's names."""
 MOST_TRANSITIONS = 1 << 21
 """Most steps, over all episodes, between two updates: their storage has to fit into memory."""
+Count = Annotated[int, at_least(1)]
 Share = Annotated[float, Rule("a number from 0 to 1", lambda value: 0.0 <= value <= 1.0)]
 Widths = Annotated[
     tuple[int, ...],
@@ -45,13 +46,13 @@ Episodes = Annotated[
 class Preset:
     """Hyper-parameters of one PPO for each agent (Schulman et al. 2017), and of its networks."""
 
-    envs: int = 256
+    envs: Count = 256
     """Episodes that run side by side."""
-    rollout: int = 12
+    rollout: Count = 12
     """Steps of each episode between two updates."""
-    epochs: int = 5
+    epochs: Count = 5
     """Passes over those steps in an update."""
-    batches: int = 4
+    batches: Count = 4
     """Minibatches of a pass."""
     gamma: Share = 0.9
     """Discount of a step."""
@@ -61,7 +62,7 @@ class Preset:
     """Clipping of the probability ratio."""
     entropy: float = 0.0
     """Weight of the entropy bonus."""
-    learning_rate: float = 1e-3
+    learning_rate: Annotated[float, POSITIVE] = 1e-3
     """First learning rate of Adam."""
     desired_kl: Annotated[float, POSITIVE] | None = 0.01
     """The learning rate is adapted to this KL divergence of an update; None: it is not."""
@@ -75,7 +76,7 @@ class Preset:
     privileged: bool = False
     """Whether critics also observe what only a simulation knows: the true key points, gains, mounts
     and effects of the episode. Actors never do (asymmetric actor-critic, Pinto et al. 2018)."""
-    action_kPa: float = 1.0
+    action_kPa: Annotated[float, POSITIVE] = 1.0
     """Change of pressure for an output of 1, kPa; it is also clipped to the limit of the pumps."""
     noise: Annotated[float, POSITIVE] = 0.5
     """First standard deviation of the actions, in outputs."""

@@ -124,6 +124,7 @@ WRONG_REWARDS = [
     ),
     (lambda state: {"arm": torch.ones(2)}, "for 'arm' are of type Tensor, expected a dict of at l"),
     (lambda state: {"arm": {}}, "for 'arm' are an empty dict, expected a dict of at least one"),
+    (lambda state: {}, "are an empty dict, expected a dict of arm"),
     (lambda state: {"bob": {"x": torch.ones(2)}}, "are of bob, expected a dict of arm"),
     (lambda state: torch.ones(2), "are of type Tensor, expected a dict of arm"),
     (

@@ -198,10 +198,13 @@ def make_with(
     if isinstance(config, str | Path):
         config = read_config(name, Path(config))
     config = default if config is None else config
+    kind = type(config)
     if not isinstance(config, type(default)):
+        of = [f.name for f in dataclasses.fields(default) if type(getattr(default, f.name)) is kind]
+        part = f" (with it as the field '{of[0]}')" if of else ""
         raise InputError(
-            f"config of '{name}' is of type {type(config).__name__}, expected "
-            f"{type(default).__name__} or the path of a TOML file"
+            f"config of '{name}' is of type {kind.__name__}, expected {type(default).__name__}"
+            f"{part} or the path of a TOML file"
         )
     changes = {
         "scene": scene,

@@ -237,7 +237,7 @@ class NarrowBlocks(Follow):
 @pytest.mark.parametrize("kind", [Narrow, NarrowBlocks, Follow])
 def test_observations_apart_from_their_blocks_are_told(kind):
     plain = make_task("track_circle")
-    own = kind("own", plain.world, plain.config, plain.marker, plain.centre, 3)
+    own = kind("own", plain.world, plain.follow, plain.marker, plain.centre, 3)
     with warnings.catch_warnings(record=True) as seen:
         warnings.simplefilter("always")
         env = surgisoft.batched_env(own, num_envs=2)

@@ -245,6 +245,31 @@ def reward_terms(task: Task, state: TaskState) -> dict[str, dict[str, Tensor]]:
     return terms
 
 
+def goal_of(task: Task, stream: Stream) -> tuple[Stream, Any]:
+    """The task's goals for (B,) random number streams, and the advanced streams.
+
+    Raises InputError for what is no such pair, which a user-defined `goal` may return.
+    """
+    found: Any = task.goal(stream)
+    pair = isinstance(found, tuple | list) and len(found) == 2
+    if not (pair and isinstance(found[0], Stream) and len(found[0].key) == len(stream.key)):
+        raise InputError(
+            f"goal of the task '{task.name}' is {_type(found)}, expected a pair: the "
+            f"{len(stream.key)} random number streams after the draws, and the goals"
+        )
+    return found[0], found[1]
+
+
+def advanced(task: Task, state: TaskState, actions: Mapping[str, Tensor]) -> TaskState:
+    """The state after a step of the task; raises InputError where it returns no state."""
+    found: Any = task.advance(state, actions)
+    if not isinstance(found, TaskState):
+        raise InputError(
+            f"advance of the task '{task.name}' is {_type(found)}, expected a TaskState"
+        )
+    return found
+
+
 def check_ended(task: Task, ended: Any, count: int) -> None:
     """Raise InputError unless what a task's `ended` returned is (B,) bool, B = count."""
     name = f"ended of the task '{task.name}'"
@@ -401,7 +426,7 @@ class Episodes:
     @rows_on_threads()
     def start(self, stream: Stream) -> TaskState:
         """Start an episode for each of the (B,) random number streams."""
-        stream, goal = self.task.goal(stream)
+        stream, goal = goal_of(self.task, stream)
         world = self.task.world.start(stream)
         return TaskState(world.donated() if self.donate else world, goal)
 
@@ -415,7 +440,7 @@ class Episodes:
         index = mask.nonzero()[:, 0]
         if not len(index):
             return state
-        stream, goal = self.task.goal(rows(state.world.stream, index))
+        stream, goal = goal_of(self.task, rows(state.world.stream, index))
         world = replace(state.world, stream=with_rows(state.world.stream, index, stream))
         return TaskState(self.task.world.reset(world, mask), with_rows(state.goal, index, goal))
 
@@ -423,7 +448,7 @@ class Episodes:
     def step(self, state: TaskState, actions: Mapping[str, Tensor]) -> tuple[TaskState, Outcome]:
         """Advance every episode one step; none is reset."""
         task = self.task
-        state = task.advance(state, actions)
+        state = advanced(task, state, actions)
         failed = state.world.failed
         terms = reward_terms(task, state)
         ended, measures = task.ended(state), task.measures(state)

@@ -146,6 +146,13 @@ def test_wrong_rewards_are_one_line_that_names_the_term(rewards, says):
 
 
 WRONG_RETURNS = [
+    (
+        "goal",
+        lambda stream: None,
+        "goal of the task 'track_circle' is of type NoneType, expected a",
+    ),
+    ("goal", lambda stream: (1, 2), "is of type tuple, expected a pair: the . random number str"),
+    ("advance", lambda state, actions: None, "advance .* is of type NoneType, expected a TaskSta"),
     ("ended", lambda state: None, "ended of the task 'track_circle' is of type NoneType, expected"),
     (
         "ended",

@@ -10,6 +10,7 @@ from surgisoft.config import POSITIVE, Rule, at_least, one_of
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.tasks.registry import spec_of
 from surgisoft.tasks.world.arm import Randomisation
+from surgisoft.tasks.world.images import ImageConfig
 from surgisoft.tasks.world.observer import AlphaBetaFilter
 from surgisoft.tasks.world.world import WorldConfig
 
@@ -27,12 +28,13 @@ ACTIVATIONS += ("softplus", "gelu", "swish", "mish", "identity")
 """Activations by rsl-rl's names."""
 MOST_TRANSITIONS = 1 << 21
 """Most steps, over all episodes, between two updates: their storage has to fit into memory."""
+Count = Annotated[int, at_least(1)]
 Share = Annotated[float, Rule("a number from 0 to 1", lambda value: 0.0 <= value <= 1.0)]
 Widths = Annotated[
     tuple[int, ...],
     Rule(
-        "at most 100 widths from 1 to 10,000",
-        lambda widths: len(widths) <= 100 and all(1 <= width <= 10_000 for width in widths),
+        "a list of 1 to 100 widths from 1 to 10,000",
+        lambda widths: 1 <= len(widths) <= 100 and all(1 <= width <= 10_000 for width in widths),
     ),
 ]
 Episodes = Annotated[
@@ -44,13 +46,13 @@ Episodes = Annotated[
 class Preset:
     """Hyper-parameters of one PPO for each agent (Schulman et al. 2017), and of its networks."""
 
-    envs: int = 256
+    envs: Count = 256
     """Episodes that run side by side."""
-    rollout: int = 12
+    rollout: Count = 12
     """Steps of each episode between two updates."""
-    epochs: int = 5
+    epochs: Count = 5
     """Passes over those steps in an update."""
-    batches: int = 4
+    batches: Count = 4
     """Minibatches of a pass."""
     gamma: Share = 0.9
     """Discount of a step."""
@@ -60,7 +62,7 @@ class Preset:
     """Clipping of the probability ratio."""
     entropy: float = 0.0
     """Weight of the entropy bonus."""
-    learning_rate: float = 1e-3
+    learning_rate: Annotated[float, POSITIVE] = 1e-3
     """First learning rate of Adam."""
     desired_kl: Annotated[float, POSITIVE] | None = 0.01
     """The learning rate is adapted to this KL divergence of an update; None: it is not."""
@@ -74,7 +76,7 @@ class Preset:
     privileged: bool = False
     """Whether critics also observe what only a simulation knows: the true key points, gains, mounts
     and effects of the episode. Actors never do (asymmetric actor-critic, Pinto et al. 2018)."""
-    action_kPa: float = 1.0
+    action_kPa: Annotated[float, POSITIVE] = 1.0
     """Change of pressure for an output of 1, kPa; it is also clipped to the limit of the pumps."""
     noise: Annotated[float, POSITIVE] = 0.5
     """First standard deviation of the actions, in outputs."""
@@ -210,6 +212,15 @@ def envs_for(name: str, task: str, steps: int) -> int:
     return envs
 
 
+def check_vectors(images: ImageConfig) -> None:
+    """Raise InputError where agents would observe images, of which this trainer learns nothing."""
+    if images.kinds:
+        raise InputError(
+            f"images is '{images.images}', but policies of this trainer see vectors only: "
+            "leave it empty, or train on surgisoft.batched_env"
+        )
+
+
 @dataclass(frozen=True)
 class Plan:
     """One training run."""
@@ -242,6 +253,8 @@ class Plan:
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise InputError(f"train: {name} is {value}, expected more than 0")
+        if (world := getattr(self.task_config, "world", None)) is not None:
+            check_vectors(world.endoscope_images)
 
     def whole_steps(self, processes: int = 1) -> int | None:
         """Steps that are trained: those of the plan, rounded up to whole updates of all processes;

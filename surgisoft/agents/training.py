@@ -13,6 +13,7 @@ import shutil
 import signal
 import threading
 import time
+import warnings
 from collections.abc import Callable
 from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
@@ -35,7 +36,7 @@ from surgisoft.agents.presets import Plan
 from surgisoft.agents.run_folder import BEST, LAST, RunFolder, create_run, damaged
 from surgisoft.agents.selection import evaluate_checkpoint, is_better
 from surgisoft.agents.vec_env import JointEnv
-from surgisoft.errors import InputError
+from surgisoft.errors import AssumptionWarning, InputError, counted
 from surgisoft.files import write_atomically
 from surgisoft.tasks.base import Task
 from surgisoft.tasks.episodes.file import save_episode
@@ -172,9 +173,20 @@ class Training:
             )
 
     def _diverged(self, agents: str) -> InputError:
-        """The error where weights are not finite: nothing is learned any more."""
+        """The error where weights are not finite: nothing is learned any more.
+
+        Observations of the last rollout that are NaN are its cause, else the size of the steps.
+        """
         preset = self.plan.preset
         steps = (self.iteration + 1) * preset.envs * preset.rollout * self.processes.count
+        for agent, ppo in self.agents.items():
+            seen = ppo.storage.observations[agent].isnan().any(-1)
+            if bad := int(seen.sum()):
+                return InputError(
+                    f"the training diverged within the first {steps:,} steps: the observation of "
+                    f"'{agent}' is NaN in {bad:,} of the last {seen.numel():,}; correct observe of "
+                    f"the task '{self.plan.task}'"
+                )
         return InputError(
             f"the training diverged: after {steps:,} steps the weights of {agents} are NaN or "
             f"infinite; train again with a smaller ppo.learning_rate (now {preset.learning_rate:g})"
@@ -347,8 +359,40 @@ def resume(
     report: Callable[[TrainingProgress], None] = lambda progress: None,
     logger: str = TENSORBOARD,
 ) -> Result:
-    """Continue a run from its last checkpoint; from the start if it has none."""
-    return _continue(RunFolder(folder), processes, device, report, logger)
+    """Continue a run from its last checkpoint.
+
+    A run that ended before its first checkpoint begins again, with a warning. Raises InputError
+    where a checkpoint was lost, and leaves the run as it is.
+    """
+    run = RunFolder(folder)
+    if not run.checkpoint(LAST).is_file():
+        _check_begun(run)
+        if processes.leads:
+            warnings.warn(
+                f"{run.path}: there is no checkpoint yet; the training begins again at its start",
+                AssumptionWarning,
+                stacklevel=2,
+            )
+    return _continue(run, processes, device, report, logger)
+
+
+def _check_begun(run: RunFolder) -> None:
+    """Raise InputError where a run without its last checkpoint has records that come after one.
+
+    The first checkpoint is written after the record of the first evaluation, or of the first
+    iteration that ends more than `CHECKPOINT_S` after the start. Twice that time allows for what
+    comes before the first iteration.
+    """
+    rows = [row for row, _ in _records(run.path / METRICS)]
+    for row in rows[:-1]:
+        seconds = row.get("wall_s")
+        late = isinstance(seconds, int | float) and seconds > 2.0 * CHECKPOINT_S
+        if late or any(name.startswith("evaluation/") for name in row):
+            raise InputError(
+                f"{run.checkpoint(LAST)}: there is no such checkpoint, but {METRICS} has "
+                f"{counted(rows[-1]['iteration'], 'iteration')}; put the file back, or train "
+                "again in a new folder"
+            )
 
 
 def reopened(folder: Path, processes: Processes, device: torch.device) -> Training:
@@ -382,7 +426,8 @@ def _check_saved(run: RunFolder, saved: dict[str, Any], plan: Plan) -> None:
 def _continue(run, processes, device, report, logger: str) -> Result:
     training = reopened(run.path, processes, device)
     plan, first = training.plan, training.iteration
-    log = _Log(run, training.iteration, logger) if processes.leads else None
+    ahead = training.share < 1.0
+    log = _Log(run, training.iteration, logger) if processes.leads and ahead else None
     written, found = time.monotonic(), training.best
     stopped = reached = False
     with _asked_to_stop() as asked, closing(log) if log else nullcontext():
@@ -464,19 +509,29 @@ def _progress(training: Training, turn: Iteration, found, seconds: float) -> Tra
     return TrainingProgress(training.share, training.steps, steps / seconds, reward, found)
 
 
+METRICS = "metrics.jsonl"
+"""File of a run's folder with one line for each iteration."""
+
+
+def _records(file: Path) -> list[tuple[dict[str, Any], str]]:
+    """Whole lines of a run's metrics, as tables and as they are; what else is there is left out."""
+    found = []
+    for line in file.read_text(errors="replace").splitlines() if file.is_file() else ():
+        with suppress(ValueError, RecursionError):
+            row = json.loads(line)
+            if isinstance(row, dict) and type(row.get("iteration")) is int:
+                found.append((row, line + "\n"))
+    return found
+
+
 class _Log:
     """`metrics.jsonl`, one line for each iteration, and the curves of a logger."""
 
     def __init__(self, run: RunFolder, iteration: int, logger: str):
         """Lines after `iteration` are dropped: those iterations are computed again."""
         self._board = open_writer(logger, run.path, run.plan(), iteration + 1)
-        file = run.path / "metrics.jsonl"
-        kept = []
-        if file.is_file():
-            for line in file.read_text(errors="replace").splitlines():
-                with suppress(ValueError, TypeError, KeyError, RecursionError):
-                    if json.loads(line)["iteration"] <= iteration:
-                        kept.append(line + "\n")
+        file = run.path / METRICS
+        kept = [line for row, line in _records(file) if row["iteration"] <= iteration]
         write_atomically(file, "".join(kept), noted=False)
         self._file = file.open("a")
 

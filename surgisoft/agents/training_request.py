@@ -14,6 +14,7 @@ from surgisoft.agents.distributed import process_count, processes
 from surgisoft.agents.loggers import TENSORBOARD, check_logger
 from surgisoft.agents.presets import Plan, Preset, config_for, envs_for, preset_for, steps_for
 from surgisoft.agents.run_folder import RunFolder, check_free, default_folder
+from surgisoft.agents.selection import has_goal
 from surgisoft.agents.session import task_config
 from surgisoft.agents.training import Result, TrainingProgress, resume, train_new
 from surgisoft.config import COMMAND_LINE, Where, from_table, merged, to_table
@@ -162,7 +163,8 @@ def shortfall(run: TrainedRun) -> str:
     """Why a finished training did not converge, in words; empty where it did.
 
     It did not where its best policies do not succeed in every episode, or, in a task without
-    success, where they are farther off than the arm model itself is.
+    success, where they are farther off than the arm model itself is. Of a task that measures
+    neither, it is not known.
     """
     best = run.result.best or {}
     why = ""
@@ -181,6 +183,13 @@ def shortfall(run: TrainedRun) -> str:
                     f"the training did not converge: {why}; {beyond}, where no training helps; "
                     "make the path smaller (size_mm) or move its centre"
                 )
+    elif best and not has_goal(best):
+        return (
+            f"whether the training converged is not known: measures of the task "
+            f"'{RunFolder(run.folder).config['task']}' has neither 'success' nor a name that ends "
+            "in 'error_mm', and the policies with the largest return are kept as best; add one to "
+            "measures"
+        )
     elif best:
         why = "no error could be measured in its evaluations"
     if not why:

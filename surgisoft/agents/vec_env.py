@@ -15,6 +15,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import Tensor
 
+from surgisoft.agents.presets import check_vectors
 from surgisoft.errors import InputError
 from surgisoft.memory import keep_freed_memory
 from surgisoft.tasks.base import Task
@@ -59,12 +60,7 @@ class JointEnv:
 
         privileged: `STATE` also has the `privileged_state` of every arm.
         """
-        images = task.world.config.endoscope_images
-        if images.kinds:
-            raise InputError(
-                f"images is '{images.images}', but policies of this trainer see vectors only: "
-                "leave it empty, or train on surgisoft.batched_env"
-            )
+        check_vectors(task.world.config.endoscope_images)
         keep_freed_memory()
         self.task, self.num_envs, self.action_kPa = task, count, action_kPa
         self.privileged = privileged

@@ -8,6 +8,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from contextvars import ContextVar
 from importlib import import_module
 from pathlib import Path
@@ -17,7 +18,7 @@ import typer
 from typer.exceptions import TyperException
 from typer.main import get_command
 
-from surgisoft.errors import AssumptionWarning, InputError, own_file, raised_by
+from surgisoft.errors import AssumptionWarning, InputError, one_line, own_file, raised_by
 from surgisoft.extras import missing_library, offering_packages
 from surgisoft.files import noted_writes
 
@@ -85,6 +86,8 @@ IMPORTED_OBJECTS = 600_000
 """New containers after which Python looks for cycles among them for the first time (a count), if no
 work has begun by then. The imports make 400,000 that all stay: looking through them once or twice
 takes 0.1 s, and as often as Python does by default 0.4 s."""
+LARGEST_WRITTEN = 1e12
+"""Whole numbers below this are written out where a message corrects one such as 1e5."""
 NEW_OBJECTS = 10_000
 """The same while a command works (Python's default is 700)."""
 NEW_GENERATIONS = 50
@@ -156,13 +159,39 @@ def _of_own_code(error: Exception) -> str | None:
     return str(raised_by(file, error, "code or what it is given")) if file else None
 
 
+def _of_value(error: TyperException) -> str:
+    """What came for an option and what was expected, from Pydantic's error, which typer names
+    without the value; empty for any other error."""
+    found: list[dict[str, Any]] = getattr(error.__cause__, "errors", list)()
+    if not found:
+        return ""
+    given, limits = str(found[0]["input"]), found[0].get("ctx", {})
+    expected = {
+        "int_parsing": "a whole number",
+        "int_from_float": "a whole number",
+        "float_parsing": "a number",
+        "greater_than_equal": f"{limits.get('ge')} or more",
+        "greater_than": f"more than {limits.get('gt')}",
+        "less_than_equal": f"{limits.get('le')} or less",
+        "less_than": f"less than {limits.get('lt')}",
+    }.get(found[0]["type"])
+    if expected is None:
+        return ""
+    if expected == "a whole number":
+        with suppress(ValueError):
+            if (number := float(given)).is_integer() and abs(number) < LARGEST_WRITTEN:
+                expected += f" in digits, {int(number)}"
+    option = error.format_message().removeprefix("Invalid value for ").partition(": ")[0]
+    return one_line(f"{option.replace(chr(39), '')} is {given[:60]!r}, expected {expected}")
+
+
 def _usage(error: TyperException, many: list[str]) -> int:
     if type(error).__name__ == "NoArgsIsHelpError":
         print(error.format_message())
         return 2
     context = getattr(error, "ctx", None)
     where = context.command_path if context else "surgisoft"
-    message = error.format_message().rstrip(".")
+    message = _of_value(error) or error.format_message().rstrip(".")
     if message.startswith("Missing argument") and many:
         message += (
             f" (values after {', '.join(many)} belong to that option: put arguments before options)"

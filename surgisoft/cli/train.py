@@ -249,12 +249,16 @@ def train(
 def _measures(found: dict | None) -> str:
     if not found:
         return "not evaluated yet"
+    from surgisoft.agents.selection import MEAN_RETURN
+
     words = []
     if "success" in found:
         words.append(f"success {found['success']:.0%}")
     if "error_mm" in found:
         error = found["error_mm"]
         words.append("error not measured" if error != error else f"error {error:.4f} mm")
+    if MEAN_RETURN in found:
+        words.append(f"return {found[MEAN_RETURN]:.4g}")
     return "evaluation: " + ", ".join(words)
 
 

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from surgisoft.errors import InputError
+from surgisoft.errors import AssumptionWarning, InputError
 from surgisoft.tasks.observations import OBSERVATION_LIMIT, ObservationBlocks
 from surgisoft.tasks.world.pytree import TensorDataclass, rows, with_rows
 from surgisoft.tasks.world.random_streams import Stream, streams
@@ -230,9 +231,7 @@ def reward_terms(task: Task, state: TaskState) -> dict[str, dict[str, Tensor]]:
     """
     found: Any = task.rewards(state)
     name, failed = f"rewards of the task '{task.name}'", state.world.failed
-    if not isinstance(found, Mapping) or found.keys() != set(task.agents):
-        is_ = f"of {', '.join(map(str, found))}" if isinstance(found, Mapping) else _type(found)
-        raise InputError(f"{name} are {is_}, expected a dict of {', '.join(task.agents)}")
+    _check_agents(f"{name} are", task, found)
     terms: dict[str, dict[str, Tensor]] = {agent: {} for agent in found}
     for agent, parts in found.items():
         if not isinstance(parts, Mapping) or not parts:
@@ -241,14 +240,132 @@ def reward_terms(task: Task, state: TaskState) -> dict[str, dict[str, Tensor]]:
                 "its name, each a tensor (B,)"
             )
         for term, value in parts.items():
-            if not isinstance(value, Tensor) or value.shape != failed.shape:
-                shape = f"of shape {tuple(value.shape)}" if isinstance(value, Tensor) else ""
-                raise InputError(
-                    f"{name}: term '{term}' of '{agent}' is {shape or _type(value)}, expected a "
-                    f"tensor of shape {tuple(failed.shape)}, one value for each environment"
-                )
+            _check_values(f"{name}: term '{term}' of '{agent}' is", value, len(failed))
             terms[agent][term] = value.masked_fill(failed, 0.0)
     return terms
+
+
+def goal_of(task: Task, stream: Stream) -> tuple[Stream, Any]:
+    """The task's goals for (B,) random number streams, and the advanced streams.
+
+    Raises InputError for what is no such pair, which a user-defined `goal` may return.
+    """
+    found: Any = task.goal(stream)
+    pair = isinstance(found, tuple | list) and len(found) == 2
+    if not (pair and isinstance(found[0], Stream) and len(found[0].key) == len(stream.key)):
+        raise InputError(
+            f"goal of the task '{task.name}' is {_type(found)}, expected a pair: the "
+            f"{len(stream.key)} random number streams after the draws, and the goals"
+        )
+    return found[0], found[1]
+
+
+def advanced(task: Task, state: TaskState, actions: Mapping[str, Tensor]) -> TaskState:
+    """The state after a step of the task; raises InputError where it returns no state."""
+    found: Any = task.advance(state, actions)
+    if not isinstance(found, TaskState):
+        raise InputError(
+            f"advance of the task '{task.name}' is {_type(found)}, expected a TaskState"
+        )
+    return found
+
+
+def check_ended(task: Task, ended: Any, count: int) -> None:
+    """Raise InputError unless what a task's `ended` returned is (B,) bool, B = count."""
+    name = f"ended of the task '{task.name}'"
+    _check_values(f"{name} is", ended, count, "a bool tensor")
+    if ended.dtype != torch.bool:
+        raise InputError(f"{name} is of type {ended.dtype}, expected torch.bool")
+
+
+def check_measures(task: Task, measures: Any, count: int) -> None:
+    """Raise InputError unless what a task's `measures` returned is name -> (B,), B = count."""
+    name = f"measures of the task '{task.name}'"
+    if not isinstance(measures, Mapping):
+        raise InputError(f"{name} are {_type(measures)}, expected a dict of tensors (B,) by name")
+    for measure, value in measures.items():
+        _check_values(f"{name}: '{measure}' is", value, count)
+
+
+def check_observations(task: Task, seen: Any, count: int) -> None:
+    """Raise InputError unless what a task's `observe` returned is agent -> (B, D), B = count."""
+    name = f"observe of the task '{task.name}'"
+    _check_agents(f"{name} is", task, seen)
+    for agent, value in seen.items():
+        if not isinstance(value, Tensor) or value.ndim != 2 or len(value) != count:
+            raise InputError(
+                f"{name}: the observation of '{agent}' is {_shape(value)}, expected a tensor of "
+                f"shape ({count}, D), one row for each environment"
+            )
+        if value.dtype != torch.float32:
+            raise InputError(
+                f"{name}: the observation of '{agent}' is of type {value.dtype}, expected "
+                "torch.float32"
+            )
+
+
+def warn_of_width(task: Task, state: TaskState, seen: Mapping[str, Tensor]) -> None:
+    """Warn (`AssumptionWarning`) of a class that overrides `observe` but not `blocks`, where the
+    blocks have another number of columns than the observations agent -> (B, D)."""
+    places = {each: _defined_in(type(task), each) for each in ("observe", "blocks")}
+    if not places["observe"] < places["blocks"] < len(type(task).__mro__):
+        return
+    for agent, blocks in cast(DocumentedTask, task).blocks(state).items():
+        width = sum(block.shape[1] for block in blocks.values())
+        if agent in seen and seen[agent].shape[1] != width:
+            warnings.warn(
+                f"observe of the task '{task.name}': the observation of '{agent}' has "
+                f"{seen[agent].shape[1]} columns, its blocks have {width}; policies see the "
+                "former: override blocks, of which observe is made, to change both",
+                AssumptionWarning,
+                stacklevel=2,
+            )
+
+
+def _defined_in(kind: type, method: str) -> int:
+    """Number of the class, in the order of search, that defines a method; their count if none."""
+    order = kind.__mro__
+    return next((n for n, each in enumerate(order) if method in vars(each)), len(order))
+
+
+def trace_of(task: Task, state: TaskState) -> tuple[Tensor, Tensor]:
+    """The task's reference and actual points, see `Task.trace`.
+
+    Raises InputError for what is not of this form, which a user-defined `trace` may return.
+    """
+    found: Any = task.trace(state)
+    name, count = f"trace of the task '{task.name}'", len(state.world.failed)
+    pair = isinstance(found, tuple | list) and len(found) == 2
+    for points in found if pair else (found,):
+        fits = isinstance(points, Tensor) and points.ndim == 3 and points.shape[::2] == (count, 3)
+        if not (pair and fits and points.shape == found[0].shape):
+            raise InputError(
+                f"{name} is {_shape(points)}, expected two tensors of the same shape "
+                f"({count}, k, 3): reference and actual points, mm"
+            )
+    return tuple(found)
+
+
+def _check_agents(is_: str, task: Task, found: Any) -> None:
+    """Raise InputError unless something is a dict of all agents of a task; is_: `rewards are`."""
+    if isinstance(found, Mapping) and found.keys() == set(task.agents):
+        return
+    given = f"of {', '.join(map(str, found))}" if isinstance(found, Mapping) and found else ""
+    raise InputError(f"{is_} {given or _type(found)}, expected a dict of {', '.join(task.agents)}")
+
+
+def _check_values(is_: str, value: Any, count: int, kind: str = "a tensor") -> None:
+    """Raise InputError unless something is a tensor (B,), B = count; is_: such as `ended is`."""
+    if not isinstance(value, Tensor) or value.shape != (count,):
+        raise InputError(
+            f"{is_} {_shape(value)}, expected {kind} of shape ({count},), one value for each "
+            "environment"
+        )
+
+
+def _shape(value: Any) -> str:
+    """Shape of a tensor in words, of another value its type."""
+    return f"of shape {tuple(value.shape)}" if isinstance(value, Tensor) else _type(value)
 
 
 def _type(value: Any) -> str:
@@ -273,8 +390,26 @@ def check_finite(task: Task, terms: Mapping[str, Mapping[str, Tensor]]) -> None:
                 )
 
 
+def check_seen(task: Task, seen: Mapping[str, Tensor]) -> None:
+    """Raise InputError where an observation, agent -> (B, D), is NaN: its policy would be too.
+
+    On a GPU nothing is checked, as by `check_finite`.
+    """
+    if task.world.device.type != "cpu":
+        return
+    for agent, value in seen.items():
+        if value.sum().isnan():  # clipped numbers have a finite sum; to look at each takes longer
+            bad = int(value.isnan().any(1).sum())
+            raise InputError(
+                f"observe of the task '{task.name}': the observation of '{agent}' is NaN in {bad} "
+                f"of {len(value)} environments; correct this method"
+            )
+
+
 class Episodes:
     """The loop of a task's episodes: start, step, observe and reset. Holds no state.
+
+    What the task's methods return is checked once for each number of episodes side by side.
 
     With `donate` the caller owns the only reference to each state: a step or reset then writes
     into the dose map of the state it is given instead of copying it, and that state is invalid
@@ -283,11 +418,15 @@ class Episodes:
 
     def __init__(self, task: Task, donate: bool = False):
         self.task, self.donate = task, donate
+        self._stepped: set[int] = set()
+        """Numbers of episodes side by side for which the outcome of a step is checked."""
+        self._observed: set[int] = set()
+        """The same for the observations."""
 
     @rows_on_threads()
     def start(self, stream: Stream) -> TaskState:
         """Start an episode for each of the (B,) random number streams."""
-        stream, goal = self.task.goal(stream)
+        stream, goal = goal_of(self.task, stream)
         world = self.task.world.start(stream)
         return TaskState(world.donated() if self.donate else world, goal)
 
@@ -301,7 +440,7 @@ class Episodes:
         index = mask.nonzero()[:, 0]
         if not len(index):
             return state
-        stream, goal = self.task.goal(rows(state.world.stream, index))
+        stream, goal = goal_of(self.task, rows(state.world.stream, index))
         world = replace(state.world, stream=with_rows(state.world.stream, index, stream))
         return TaskState(self.task.world.reset(world, mask), with_rows(state.goal, index, goal))
 
@@ -309,12 +448,17 @@ class Episodes:
     def step(self, state: TaskState, actions: Mapping[str, Tensor]) -> tuple[TaskState, Outcome]:
         """Advance every episode one step; none is reset."""
         task = self.task
-        state = task.advance(state, actions)
+        state = advanced(task, state, actions)
         failed = state.world.failed
         terms = reward_terms(task, state)
-        terminated = task.ended(state) | failed
+        ended, measures = task.ended(state), task.measures(state)
+        if (count := len(failed)) not in self._stepped:
+            check_ended(task, ended, count)
+            check_measures(task, measures, count)
+            self._stepped.add(count)
+        terminated = ended | failed
         truncated = (state.world.steps >= task.steps) & ~terminated
-        return state, Outcome(terms, terminated, truncated, task.measures(state))
+        return state, Outcome(terms, terminated, truncated, measures)
 
     def observe_anew(
         self, state: TaskState, index: Tensor, seen: Mapping[str, Tensor]
@@ -327,8 +471,13 @@ class Episodes:
     @rows_on_threads()
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         """Clipped observations, agent -> (B, D): finite; zero where the environment failed."""
-        failed = state.world.failed[:, None]
+        failed, found = state.world.failed[:, None], self.task.observe(state)
+        if (count := len(failed)) not in self._observed:
+            check_observations(self.task, found, count)
+            if not self._observed:
+                warn_of_width(self.task, state, found)
+            self._observed.add(count)
         return {
             agent: seen.masked_fill(failed, 0.0).clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
-            for agent, seen in self.task.observe(state).items()
+            for agent, seen in found.items()
         }

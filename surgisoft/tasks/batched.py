@@ -17,7 +17,7 @@ from torch import Tensor
 
 from surgisoft.memory import keep_freed_memory
 from surgisoft.tasks.arguments import actions_of, check_agents, whole
-from surgisoft.tasks.base import Task, TaskState, check_finite
+from surgisoft.tasks.base import Task, TaskState, check_finite, check_seen
 from surgisoft.tasks.graphed import donated_episodes
 from surgisoft.tasks.registry import task_of
 from surgisoft.tasks.world.images import VECTOR, images_of
@@ -106,7 +106,9 @@ class BatchedEnv:
             steps = torch.arange(self.num_envs, device=self.device) * SPREAD % self.task.steps
             state = replace(state, world=replace(state.world, steps=steps))
         self._state = state
-        return self._with_images(self._episodes.observe(state), self._drawn(state))
+        vectors = self._episodes.observe(state)
+        check_seen(self.task, vectors)
+        return self._with_images(vectors, self._drawn(state))
 
     @rows_on_threads()
     @torch.inference_mode()
@@ -120,6 +122,7 @@ class BatchedEnv:
         failed = state.world.failed.clone()
         images = self._drawn(state)
         vectors = self._episodes.observe(state)
+        check_seen(self.task, vectors)
         final = self._with_images(vectors, images)
         now = self._state = self._episodes.reset(state, outcome.done)
         index, seen = outcome.done.nonzero()[:, 0], final

@@ -48,7 +48,8 @@ def laser_plane(
     start = points_at_start(world)
     height = start[0, -1, 2] + config.distance_mm
     spot = BeamSpot(world.arms["arm"], height)
-    return Follow("laser_plane", world, config.follow, spot, spot(start)[0], directions=2)
+    centre = spot(start)[0]
+    return Follow("laser_plane", world, config.follow, spot, centre, directions=2, whole=config)
 
 
 LASER_PLANE = TaskSpec(

@@ -19,6 +19,8 @@ from surgisoft.tasks.base import (
     Task,
     TaskState,
     check_finite,
+    check_seen,
+    trace_of,
 )
 from surgisoft.tasks.observations import OBSERVATION_LIMIT
 from surgisoft.tasks.world.images import VECTOR, images_of
@@ -72,7 +74,7 @@ class Pictures:
         found = []
         for index in range(count):
             one = rows(state, torch.tensor([index], device=state.world.steps.device))
-            found.append(self._picture.image(one.world, self._task.trace(one)[0]))
+            found.append(self._picture.image(one.world, trace_of(self._task, one)[0]))
         return tuple(found)
 
 
@@ -176,5 +178,7 @@ class NumpyAdapter:
 
     @torch.inference_mode()
     def vectors(self, state: TaskState) -> dict[str, np.ndarray]:
-        """Observations without images, agent -> (B, D) float32."""
-        return {agent: seen.cpu().numpy() for agent, seen in self.episodes.observe(state).items()}
+        """Observations without images, agent -> (B, D) float32; an InputError where one is NaN."""
+        found = self.episodes.observe(state)
+        check_seen(self.task, found)
+        return {agent: seen.cpu().numpy() for agent, seen in found.items()}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -186,13 +186,17 @@ class Follow:
         marker: Marker,
         centre_mm: Tensor,
         directions: int,
+        whole: Any = None,
     ):
         """Build the task for a level path with its centre at centre_mm, (3,) mm.
 
         marker: see `Marker`. The expert controls the first `directions` coordinates of that
-        point: 2 where the third is constant.
+        point: 2 where the third is constant. whole: the configuration of which `config` is a part;
+        None: it has no other.
         """
-        self.name, self.world, self.config = name, world, config
+        self.name, self.world, self.follow = name, world, config
+        self.config: Any = config if whole is None else whole
+        """The whole configuration of the task, as `config=` of the environments takes it."""
         self.marker, self.centre = marker, centre_mm
         self.dt_s = world.config.dt_s
         self.approach = round(config.approach_s / self.dt_s)
@@ -213,15 +217,15 @@ class Follow:
 
     def goal(self, stream: Stream) -> tuple[Stream, FollowGoal]:
         """Draw start and direction on the path for each random number stream; empty history."""
-        stream, traversal = draw_traversal(stream, self.config.any_start)
-        size = len(stream.key), self.config.history_steps, self.arm.chambers
+        stream, traversal = draw_traversal(stream, self.follow.any_start)
+        size = len(stream.key), self.follow.history_steps, self.arm.chambers
         return stream, FollowGoal(traversal, ObservationHistory.empty(*size, self.world.device))
 
     def target_mm(self, state: TaskState[FollowGoal], ahead: int = 0) -> Tensor:
         """(B, 3) mm, world frame: the reference `ahead` steps from now."""
         traversal = state.goal.traversal
         share = traversal.share(state.world.steps + ahead, self.approach, self.loop)
-        flat = self.config.size_mm * PATHS[self.config.path](share)
+        flat = self.follow.size_mm * PATHS[self.follow.path](share)
         return self.centre + torch.nn.functional.pad(flat, (0, 1))
 
     def out_of_reach_mm(self) -> Tensor:
@@ -235,7 +239,7 @@ class Follow:
         """
         spec = self.arm.model.spec
         share = torch.linspace(0.0, 1.0, REACH_POINTS + 1, device=self.centre.device)[:-1]
-        flat = self.config.size_mm * PATHS[self.config.path](share)
+        flat = self.follow.size_mm * PATHS[self.follow.path](share)
         target = self.centre + torch.nn.functional.pad(flat, (0, 1))
         grid = actuation_grid(spec).to(target) / units_per_kPa(spec)
         low, high = grid.amin(0), grid.amax(0)
@@ -299,20 +303,20 @@ class Follow:
         """
         part, history = state.world.arms["arm"], state.goal.history
         point = self.marker(part.steered_mm, part.known_mount)
-        preview = self.config.preview
+        preview = self.follow.preview
         targets = [self.target_mm(state, ahead) for ahead in range(max(preview, 1) + 1)]
         errors = [target - point for target in targets[: preview + 1]]
         close = errors[:2]
-        if self.config.one_step_prediction:
+        if self.follow.one_step_prediction:
             close = [*close, targets[1] - self.marker(self._held(part), part.known_mount)]
-        scaled = asinh_of([*errors, *(error / self.config.fine_mm for error in close)])
+        scaled = asinh_of([*errors, *(error / self.follow.fine_mm for error in close)])
         wide, fine = scaled[: len(errors)], scaled[len(errors) :]
         blocks = {
             SHAPE: free_points(part.steered_mm - self._rest).flatten(1) / 10.0,
             **numbered(ERROR, wide),
             **numbered(FINE, fine[: len(errors[:2])]),
         }
-        if self.config.one_step_prediction:
+        if self.follow.one_step_prediction:
             blocks[PREDICTED] = fine[-1]
         blocks |= pressure_blocks(self.arm, part)
         blocks[PRESSURE_HISTORY] = history.kPa.flatten(1)
@@ -337,8 +341,8 @@ class Follow:
     def rewards(self, state: TaskState[FollowGoal]) -> dict[str, dict[str, Tensor]]:
         """Weighted reward terms, see `FollowWeights`."""
         error = self.error_mm(state)
-        terms = {"track": (-error).exp(), "fine": (-error / self.config.fine_mm).exp()}
-        return {"arm": weighted(terms, self.config.weights)}
+        terms = {"track": (-error).exp(), "fine": (-error / self.follow.fine_mm).exp()}
+        return {"arm": weighted(terms, self.follow.weights)}
 
     def ended(self, state: TaskState[FollowGoal]) -> Tensor:
         """Never: an episode lasts its full time."""

@@ -115,10 +115,10 @@ def _loaded(entry: EntryPoint) -> TaskSpec:
 def make_task(name: str, config: Any = None, device: str | torch.device = "cpu") -> DocumentedTask:
     """Build the named task; without a config with its default one.
 
-    Raises InputError for an episode of no step or of more than `MOST_STEPS`, for a count in the
-    configuration of one of the package's tasks above `MOST_COUNT`, and for an exception in the code
-    that builds a task of another package. Warns (`AssumptionWarning`)
-    where only the tip of an arm was measured and the task needs more of it.
+    Raises InputError for an episode of no step or of more than `MOST_STEPS`, for a delay that is no
+    shorter than an episode, for a count in the configuration of one of the package's tasks above
+    `MOST_COUNT`, and for an exception in the code that builds a task of another package. Warns
+    (`AssumptionWarning`) where only the tip of an arm was measured and the task needs more of it.
     """
     spec = spec_of(name)
     if name in TASKS:
@@ -145,6 +145,11 @@ def make_task(name: str, config: Any = None, device: str | torch.device = "cpu")
         raise InputError(
             f"{name}: an episode of no step; expected longer times or a shorter dt_s in its "
             "configuration"
+        )
+    if (delay := task.world.config.randomisation.delay) >= steps:
+        raise InputError(
+            f"{name}: world.randomisation.delay is {delay} in episodes of {steps} steps; expected "
+            "fewer, so that actions take effect before the end"
         )
     say_assumed(task.name, task.world.arms)
     return task
@@ -193,10 +198,13 @@ def make_with(
     if isinstance(config, str | Path):
         config = read_config(name, Path(config))
     config = default if config is None else config
+    kind = type(config)
     if not isinstance(config, type(default)):
+        of = [f.name for f in dataclasses.fields(default) if type(getattr(default, f.name)) is kind]
+        part = f" (with it as the field '{of[0]}')" if of else ""
         raise InputError(
-            f"config of '{name}' is of type {type(config).__name__}, expected "
-            f"{type(default).__name__} or the path of a TOML file"
+            f"config of '{name}' is of type {kind.__name__}, expected {type(default).__name__}"
+            f"{part} or the path of a TOML file"
         )
     changes = {
         "scene": scene,

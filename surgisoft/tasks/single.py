@@ -6,7 +6,7 @@ one.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -213,17 +213,30 @@ class BatchedEnv(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None):
+    def reset(self, *, seed: int | Sequence[int | None] | None = None, options: dict | None = None):
         """Start episodes; environment i has seed + i, and equals a `SingleEnv` of that seed.
 
-        Without a seed the random number streams of the last episodes continue.
+        A list has the seed of each environment, None for any. Without a seed the random number
+        streams of the last episodes continue. Raises InputError for another seed or length.
         """
         if seed is None and self._state is not None:
             self._state = self.adapter.restart(self._state)
         else:
-            first = entropy_seed() if seed is None else seed
-            self._state = self.adapter.seeded(range(first, first + self.num_envs))
+            self._state = self.adapter.seeded(self._seeds(seed))
         return self.adapter.observations(self._state)[self._agent], {}
+
+    def _seeds(self, seed: Any) -> list[int]:
+        """The seed of each environment, see `reset`."""
+        if not isinstance(seed, list | tuple) and not getattr(seed, "ndim", 0):
+            first = entropy_seed() if seed is None else whole("seed", seed, 0)
+            return list(range(first, first + self.num_envs))
+        if len(seed) != self.num_envs:
+            raise InputError(
+                f"seed is a list of {len(seed)}, expected one for each of {self.num_envs} "
+                "environments, or one whole number"
+            )
+        named = ((f"seed[{i}]", each) for i, each in enumerate(seed))
+        return [entropy_seed() if one is None else whole(name, one, 0) for name, one in named]
 
     def step(self, actions: np.ndarray):
         """Advance all environments: (observations, rewards, terminated, truncated, infos).

@@ -58,7 +58,7 @@ def tip(points_mm: Tensor, mount: Tensor | None = None) -> Tensor:
 def _track(name: str, config: TrackConfig, device) -> Follow:
     world = level_world(config.world, config.mean_kPa, config.follow.arm, device)
     centre = tip(points_at_start(world))[0]
-    return Follow(name, world, config.follow, tip, centre, directions=3)
+    return Follow(name, world, config.follow, tip, centre, directions=3, whole=config)
 
 
 def level_world(

@@ -55,6 +55,10 @@ def packaged(tmp_path_factory):
     ("make", "message"),
     [
         (lambda: Preset(epochs=0), "preset: epochs is 0, expected more than 0"),
+        (
+            lambda: TrainingRequest("track_circle", ppo={"hidden": []}).plan(),
+            "ppo.hidden: got a list []; expected a list of 1 to 100 widths from 1 to 10,000",
+        ),
         (lambda: Preset(envs=4, rollout=4, batches=9), "leaves fewer than 2 samples in each"),
         (lambda: plan(steps=None), "neither steps nor minutes are given"),
         (lambda: plan(target_error=-1.0), "target_error is -1.0, expected more than 0"),

@@ -35,7 +35,7 @@ def test_trains_and_prints_the_result(tmp_path, capsys):
     assert config["arms"]["arm"]["effects"] == ["hysteresis"]
     assert set(config["versions"]) == {"surgisoft", "python", "torch", "rsl-rl-lib"}
     task = RunFolder(folder).task()
-    assert task.config.size_mm == 12.0
+    assert task.config.follow.size_mm == 12.0
     assert task.world.config.randomisation.start_kPa == 1.0
     rows = [json.loads(row) for row in (folder / "metrics.jsonl").read_text().splitlines()]
     assert [row["steps"] for row in rows] == [192, 384, 576]

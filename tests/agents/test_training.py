@@ -35,7 +35,7 @@ from surgisoft.agents.training import Clock, Training, resume, train_new
 from surgisoft.agents.training_request import TrainingRequest
 from surgisoft.agents.vec_env import STATE, JointEnv
 from surgisoft.cli import run as command
-from surgisoft.errors import InputError
+from surgisoft.errors import AssumptionWarning, InputError
 from surgisoft.tasks.registry import config_of, make_task, with_fields
 
 CPU = torch.device("cpu")
@@ -180,10 +180,48 @@ def test_a_kill_between_checkpoints_loses_nothing(run, tmp_path):
     assert [row["iteration"] for row in rows] == [1, 2, 3, 4]
 
 
+def test_a_run_whose_checkpoint_was_lost_is_refused_and_keeps_its_records(run, tmp_path):
+    """By its records: the second of four iterations was evaluated, after which it was saved."""
+    lost = tmp_path / "lost"
+    shutil.copytree(run.path, lost)
+    for checkpoint in (lost / "checkpoints").iterdir():
+        checkpoint.unlink()
+    before = {path: path.read_bytes() for path in lost.rglob("*") if path.is_file()}
+    with pytest.raises(InputError, match=r"last\.pt: there is no such checkpoint, but .* has 4 it"):
+        resume(lost, Processes(), CPU)
+    assert {path: path.read_bytes() for path in lost.rglob("*") if path.is_file()} == before
+    row = {"iteration": 1, "wall_s": 61.0}
+    (lost / "metrics.jsonl").write_text(f"{json.dumps(row)}\n{json.dumps(row)}\n")
+    with pytest.raises(InputError, match="has 1 iteration; put the file back, or train again"):
+        resume(lost, Processes(), CPU)
+
+
+def test_a_run_killed_before_its_first_checkpoint_begins_again_and_says_so(run, tmp_path):
+    """Also between the record of the first evaluation and the checkpoint after it."""
+    killed = tmp_path / "killed"
+    shutil.copytree(run.path, killed)
+    (killed / "checkpoints" / "last.pt").unlink()
+    rows = (killed / "metrics.jsonl").read_text().splitlines(keepends=True)
+    (killed / "metrics.jsonl").write_text("".join(rows[:2]) + "[3]\nhalf")
+    with pytest.warns(AssumptionWarning, match="there is no checkpoint yet; the training begins"):
+        assert resume(killed, Processes(), CPU).done
+    assert_equal(weights(run), weights(RunFolder(killed)))
+
+
+def test_a_finished_run_that_is_resumed_stays_as_it_is(run, tmp_path):
+    done = tmp_path / "done"
+    shutil.copytree(run.path, done)
+    before = {path: path.read_bytes() for path in done.rglob("*") if path.is_file()}
+    assert resume(done, Processes(), CPU).updates == 0
+    assert {path: path.read_bytes() for path in done.rglob("*") if path.is_file()} == before
+
+
 def test_a_kill_while_a_run_is_reopened_keeps_its_records(run, tmp_path, monkeypatch):
     """Whatever writes the records ends before its last byte; the earlier ones are still there."""
     killed = tmp_path / "killed"
     shutil.copytree(run.path, killed)
+    config = json.loads((killed / "config.json").read_text())
+    (killed / "config.json").write_text(json.dumps(config | {"steps": 2 * config["steps"]}))
     before = (killed / "metrics.jsonl").read_bytes()
     assert len(before.splitlines()) == 4
 
@@ -590,6 +628,14 @@ def test_the_better_checkpoint_is_kept():
     assert is_better({"success": 0.5, "error_mm": 0.09}, one)
     assert not is_better(one, one)
     assert not is_better({"success": 0.5, "error_mm": float("nan")}, one)
+
+
+def test_without_success_and_error_the_larger_return_is_better():
+    one = {"passes": 3.0, "mean_return": -2.0}
+    assert is_better({"passes": 1.0, "mean_return": -1.0}, one)
+    assert not is_better({"passes": 9.0, "mean_return": -3.0}, one)
+    assert not is_better({"passes": 9.0, "mean_return": float("nan")}, one)
+    assert not is_better({"error_mm": 2.0, "mean_return": 9.0}, {"error_mm": 1.0})
 
 
 def test_an_evaluation_is_means_over_episodes_of_the_right_steps(monkeypatch):

@@ -493,6 +493,26 @@ def test_a_recording_that_is_there_is_refused_before_the_rig_moves(tmp_path, mon
     assert there.read_text() == "x"
 
 
+@pytest.mark.parametrize(
+    ("option", "told"),
+    [
+        ("--steps 1e5", "--steps is '1e5', expected a whole number in digits, 100000"),
+        ("--steps 2.5", "--steps is '2.5', expected a whole number"),
+        ("--steps 1e999", "--steps is '1e999', expected a whole number"),
+        ("--minutes x", "--minutes is 'x', expected a number"),
+        ("--seed -1", "--seed is '-1', expected 0 or more"),
+        ("--threads 1000", "--threads is '1000', expected 256 or less"),
+        ("--minutes", "Option '--minutes' requires an argument"),
+        ("--nothing 1", "No such option: --nothing"),
+    ],
+)
+def test_a_wrong_value_of_an_option_is_told_with_what_is_expected(option, told, capsys):
+    assert run(["train", *option.split()]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"surgisoft: error: {told}; see 'surgisoft")
+    assert error.count("\n") == 1
+
+
 def test_each_hidden_effect_has_its_own_strength(tmp_path, monkeypatch):
     asked = {}
 

@@ -88,10 +88,15 @@ def test_a_training_with_assignments_and_a_service(tmp_path, monkeypatch, capsys
         ("task=track_circle --task track_circle", "give one of them"),
         ("task=track_circle --logger nowhere", "unknown logger"),
         ("task=track_circle size", "expected FIELD=VALUE"),
+        ("task=track_circle ppo.learning_rate=-1", "ppo.learning_rate: got integer -1; expected a"),
+        ("task=track_circle ppo.epochs=0", "command line: ppo.epochs: got integer 0; expected an"),
+        ("task=circle_ablation world.endoscope_images.images=rgb", "see vectors only: leave it"),
     ],
 )
 def test_a_wrong_assignment_is_one_line(words, said, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    for command in ("make_task", "create_run"):  # neither is begun
+        monkeypatch.delattr(f"surgisoft.agents.training.{command}")
     assert run(["train", *words.split()]) == 2
     error = capsys.readouterr().err
     assert said in error

@@ -167,6 +167,39 @@ def test_the_batched_environments_are_the_single_ones(name):
             assert reward == pytest.approx(rewards[i], rel=2e-3, abs=1e-5)
 
 
+@pytest.mark.parametrize("kind", [list, tuple, np.array])
+def test_a_list_of_seeds_has_one_for_each_environment(kind):
+    many, single = BatchedEnv("track_circle", 3), SingleEnv("track_circle")
+    seen, _ = many.reset(seed=kind([9, 2, 2]))
+    for row, seed in zip(seen, (9, 2, 2), strict=True):
+        np.testing.assert_allclose(single.reset(seed=seed)[0], row, atol=1e-4)
+    assert not np.allclose(seen[0], seen[1])
+    fixed, _ = many.reset(seed=[9, None, 2])
+    assert np.array_equal(fixed[[0, 2]], seen[[0, 2]])
+    assert not np.allclose(fixed[1], seen[1]), "no seed of its own"
+
+
+@pytest.mark.parametrize(
+    ("seed", "told"),
+    [
+        ("a", "seed is 'a', expected a whole number, 0 or more"),
+        (-1, "seed is -1, expected 0 or more"),
+        (1.5, "seed is 1.5, expected a whole number"),
+        ([1, 2], "seed is a list of 2, expected one for each of 3 environments"),
+        ([1, "b", 2], r"seed\[1\] is 'b', expected a whole number"),
+        ([1, 2, -3], r"seed\[2\] is -3, expected 0 or more"),
+    ],
+)
+def test_another_seed_is_refused_and_the_episodes_go_on(seed, told):
+    many, other = BatchedEnv("track_circle", 3, SHORT), BatchedEnv("track_circle", 3, SHORT)
+    for env in (many, other):
+        env.reset(seed=4)
+    with pytest.raises(InputError, match=told):
+        many.reset(seed=seed)
+    still = np.zeros((3, 3), np.float32)
+    assert np.array_equal(many.step(still)[0], other.step(still)[0])
+
+
 def test_finished_environments_begin_anew_in_the_same_step():
     many = BatchedEnv("track_circle", 4, SHORT)
     many.reset(seed=0)

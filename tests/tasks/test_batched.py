@@ -9,7 +9,8 @@ from gymnasium.wrappers import RenderCollection
 import surgisoft
 from surgisoft.errors import InputError
 from surgisoft.tasks.circle_ablation import CircleAblation
-from surgisoft.tasks.registry import config_of, with_fields
+from surgisoft.tasks.path_following import FollowConfig
+from surgisoft.tasks.registry import config_of, make_task, with_fields
 from surgisoft.tasks.single import BatchedEnv
 
 
@@ -92,6 +93,28 @@ def test_a_config_may_be_a_file_and_any_other_one_is_refused(tmp_path):
     ):
         with pytest.raises(InputError, match="is of type dict, expected TrackBodyConfig"):
             make({"time_s": 1.5})
+
+
+@pytest.mark.parametrize("name", ["track_circle", "track_square", "laser_plane"])
+def test_the_configuration_of_a_task_builds_it_again(name):
+    """Also the parts of the world and of the path, here with a start that is not at rest."""
+    given = with_fields(config_of(name), size_mm=9.0, gain=0.1, mean_kPa=15.0)
+    task = make_task(name, given)
+    assert task.config == given
+    envs = [
+        surgisoft.batched_env(task, 3, seed=2),
+        surgisoft.batched_env(name, 3, seed=2, config=task.config),
+        surgisoft.batched_env(name, 3, seed=2),
+    ]
+    one, again, usual = (env.step({"arm": torch.ones(3, 3)}).observations["arm"] for env in envs)
+    assert torch.equal(one, again)
+    assert not torch.allclose(one, usual)
+
+
+def test_a_part_of_a_configuration_is_told_as_one():
+    told = r"FollowConfig, expected TrackConfig \(with it as the field 'follow'\) or the path of"
+    with pytest.raises(InputError, match=told):
+        surgisoft.batched_env("track_circle", 1, config=FollowConfig())
 
 
 def test_pictures_show_the_arm_where_it_is():

@@ -5,6 +5,7 @@ import json
 import math
 import re
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,8 @@ import surgisoft
 from surgisoft.cli import run
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Episodes
+from surgisoft.tasks.episodes.log import EpisodeRecorder
+from surgisoft.tasks.path_following import Follow
 from surgisoft.tasks.registry import TASKS, make_task, spec_of, task_names
 from surgisoft.tasks.single import BatchedEnv
 
@@ -121,6 +124,7 @@ WRONG_REWARDS = [
     ),
     (lambda state: {"arm": torch.ones(2)}, "for 'arm' are of type Tensor, expected a dict of at l"),
     (lambda state: {"arm": {}}, "for 'arm' are an empty dict, expected a dict of at least one"),
+    (lambda state: {}, "are an empty dict, expected a dict of arm"),
     (lambda state: {"bob": {"x": torch.ones(2)}}, "are of bob, expected a dict of arm"),
     (lambda state: torch.ones(2), "are of type Tensor, expected a dict of arm"),
     (
@@ -139,6 +143,119 @@ def test_wrong_rewards_are_one_line_that_names_the_term(rewards, says):
         env.reset(seed=0)
         with pytest.raises(InputError, match=f"rewards of the task 'track_circle'.*{says}"):
             env.step(still)
+
+
+WRONG_RETURNS = [
+    (
+        "goal",
+        lambda stream: None,
+        "goal of the task 'track_circle' is of type NoneType, expected a",
+    ),
+    ("goal", lambda stream: (1, 2), "is of type tuple, expected a pair: the . random number str"),
+    ("advance", lambda state, actions: None, "advance .* is of type NoneType, expected a TaskSta"),
+    ("ended", lambda state: None, "ended of the task 'track_circle' is of type NoneType, expected"),
+    (
+        "ended",
+        lambda state: torch.zeros(3, dtype=torch.bool),
+        r"is of shape \(3,\), .* \(2,\), one",
+    ),
+    ("ended", lambda state: torch.zeros(2), "ended .* is of type torch.float32, expected torch.bo"),
+    ("measures", lambda state: None, "measures .* are of type NoneType, expected a dict of tenso"),
+    ("measures", lambda state: {"error_mm": torch.ones(2, 2)}, r"'error_mm' is of shape \(2, 2\)"),
+    ("measures", lambda state: {"error_mm": 0.5}, "'error_mm' is of type float, expected a tens"),
+    ("observe", lambda state: torch.ones(2, 5), "observe .* is of type Tensor, expected a dict of"),
+    (
+        "observe",
+        lambda state: {"bob": torch.ones(2, 5)},
+        "observe .* is of bob, expected a dict of",
+    ),
+    ("observe", lambda state: {"arm": torch.ones(5)}, r"of 'arm' is of shape \(5,\), .*\(\d, D\)"),
+    (
+        "observe",
+        lambda state: {"arm": torch.ones(9, 5)},
+        r"is of shape \(9, 5\), expected a tensor",
+    ),
+    (
+        "observe",
+        lambda state: {"arm": torch.ones(len(state.world.steps), 5).double()},
+        "is of type torch.float64, expected torch.float32",
+    ),
+    (
+        "observe",
+        lambda state: {"arm": torch.tensor([[1.0, torch.nan]]).repeat(len(state.world.steps), 1)},
+        r"observe .*the observation of 'arm' is NaN in (\d) of \1 environments; correct this",
+    ),
+]
+
+
+def first_step(environments, task, still):
+    env = environments(task, 2)
+    env.reset(seed=0)
+    env.step(still)
+
+
+@pytest.mark.parametrize(("method", "function", "says"), WRONG_RETURNS)
+def test_what_another_method_returns_is_told_with_its_shape(method, function, says):
+    """By the first step, in tensors and in arrays."""
+    for environments, still in (
+        (surgisoft.batched_env, {"arm": torch.zeros(2, 3)}),
+        (BatchedEnv, torch.zeros(2, 3)),
+    ):
+        task = make_task("track_circle")
+        setattr(task, method, function)
+        with pytest.raises(InputError, match=says):
+            first_step(environments, task, still)
+
+
+def test_what_differs_with_the_number_of_episodes_is_told():
+    """A rollout goes on with fewer episodes when half of them are over."""
+    task = make_task("track_circle")
+    task.ended = lambda state: torch.zeros(4, dtype=torch.bool)
+    episodes = Episodes(task)
+    step = {"arm": torch.zeros(4, 3)}
+    episodes.step(episodes.seeded(0, 4), step)
+    with pytest.raises(
+        InputError, match=r"is of shape \(4,\), expected a bool tensor of shape \(2,"
+    ):
+        episodes.step(episodes.seeded(0, 2), {"arm": step["arm"][:2]})
+
+
+@pytest.mark.parametrize(
+    "trace", [lambda state: None, lambda state: (torch.ones(1, 3), torch.ones(1, 3))]
+)
+def test_a_trace_of_another_form_is_one_line(trace):
+    task = make_task("track_circle")
+    task.trace = trace
+    says = r"trace of the task 'track_circle' is of .*, expected two tensors .*\(1, k, 3\)"
+    with pytest.raises(InputError, match=says):
+        EpisodeRecorder(task, Episodes(task).seeded(0, 1), policy="scripted", seed=0)
+
+
+class Narrow(Follow):
+    def observe(self, state):
+        return {"arm": super().observe(state)["arm"][:, :3]}
+
+
+class NarrowBlocks(Follow):
+    def blocks(self, state):
+        return {"arm": dict(list(super().blocks(state)["arm"].items())[:1])}
+
+
+@pytest.mark.parametrize("kind", [Narrow, NarrowBlocks, Follow])
+def test_observations_apart_from_their_blocks_are_told(kind):
+    plain = make_task("track_circle")
+    own = kind("own", plain.world, plain.follow, plain.marker, plain.centre, 3)
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        env = surgisoft.batched_env(own, num_envs=2)
+    width = surgisoft.batched_env(plain, num_envs=2).observation_sizes["arm"]
+    told = [str(each.message) for each in seen]
+    if kind is Narrow:
+        assert env.observation_sizes == {"arm": 3}
+        assert len(told) == 1
+        assert f"the observation of 'arm' has 3 columns, its blocks have {width};" in told[0]
+    else:
+        assert not told
 
 
 def test_rewards_of_an_arm_that_failed_may_be_nan():
@@ -164,6 +281,52 @@ def test_a_training_names_the_reward_term_that_is_nan(installed, tmp_path, monke
     assert "reward term 'smooth' of 'arm' is NaN or infinite within the first 384 steps" in told
     assert "correct the rewards of the task 'smooth_circle'" in told
     assert not Path("own").exists(), "nothing was learned"
+
+
+def test_a_training_names_observations_that_are_nan(installed, tmp_path, monkeypatch, capsys):
+    """Neither its learning rate nor its rewards."""
+    monkeypatch.chdir(tmp_path)
+    own = type(make_task("smooth_circle"))
+    plain = own.observe
+
+    def spoilt(task, state):
+        seen = plain(task, state)["arm"]
+        return {"arm": seen.masked_fill((state.world.steps == 7)[:, None], torch.nan)}
+
+    monkeypatch.setattr(own, "observe", spoilt)
+    options = "--task smooth_circle --steps 512 --envs 32 ppo.evaluation_episodes=2 -o own"
+    assert run(["train", *options.split()]) == 2
+    told = capsys.readouterr().err
+    assert "the training diverged within the first 384 steps: the observation of 'arm'" in told
+    # Episodes begin at steps 7919 i modulo 230; an action of NaN in step 7 ends one.
+    spoilt_rows = 0
+    for step in (7919 * i % 230 for i in range(32)):
+        for _ in range(12):
+            spoilt_rows += step == 7
+            step = 0 if step in (7, 229) else step + 1
+    assert f"is NaN in {spoilt_rows} of the last 384; correct observe of the task" in told
+    assert "learning_rate" not in told
+    assert not Path("own").exists(), "nothing was learned"
+
+
+def test_a_task_without_success_and_error_keeps_the_largest_return(
+    installed, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    own = type(make_task("smooth_circle"))
+    monkeypatch.setattr(
+        own, "measures", lambda task, state: {"five": 5.0 + 0.0 * state.world.steps}
+    )
+    options = "--task smooth_circle --steps 1536 --envs 32 ppo.evaluation_episodes=2 -o own"
+    assert run(["train", *options.split(), "ppo.evaluate_every=1"]) == 0
+    printed = capsys.readouterr()
+    rows = [json.loads(line) for line in Path("own/metrics.jsonl").read_text().splitlines()]
+    returns = [row["evaluation/mean_return"] for row in rows]
+    best = torch.load("own/checkpoints/best.pt", weights_only=True)
+    assert best["iteration"] == 1 + returns.index(max(returns))
+    assert f"best evaluation: return {max(returns):.4g}" in printed.out
+    assert "whether the training converged is not known: measures of the task 'smo" in printed.err
+    assert "did not converge" not in printed.err
 
 
 def test_what_a_package_offers_is_checked(installed):

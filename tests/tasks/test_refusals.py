@@ -2,6 +2,7 @@
 
 import dataclasses
 import zipfile
+from statistics import NormalDist
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,9 +19,15 @@ from surgisoft.tasks.episodes.file import load_episode
 from surgisoft.tasks.numpy_adapter import NumpyAdapter
 from surgisoft.tasks.parallel import parallel_env
 from surgisoft.tasks.path_following import FollowWeights
-from surgisoft.tasks.registry import config_of, make_task, make_with, with_present_names
+from surgisoft.tasks.registry import (
+    config_of,
+    make_task,
+    make_with,
+    with_fields,
+    with_present_names,
+)
 from surgisoft.tasks.single import BatchedEnv, SingleEnv, one_agent
-from surgisoft.tasks.world.arm import Randomisation
+from surgisoft.tasks.world.arm import LARGEST_GAIN, Randomisation
 from surgisoft.tasks.world.observer import AlphaBetaFilter
 from surgisoft.tasks.world.pytree import tree_map
 from surgisoft.tasks.world.random_streams import streams
@@ -34,6 +41,7 @@ from tests.refusals import refusal
     ("make", "message"),
     [
         (lambda: Randomisation(lesions=0), "randomisation: lesions is 0, expected at least 1"),
+        (lambda: Randomisation(gain=5.0), "randomisation: gain is 5, expected at most 0.3"),
         (lambda: AlphaBetaFilter(gain=2.0), "observer: gain is 2.0, expected 0 to 1"),
         (lambda: AlphaBetaFilter(drift_gain=-1.0), "observer: drift_gain is -1.0, expected 0 to 1"),
         (lambda: Respiration(irregular=0.9), "respiration: irregular is 0.9, expected 0 to 0.5"),
@@ -57,6 +65,23 @@ from tests.refusals import refusal
 )
 def test_what_cannot_be_meant_is_one_line(make, message):
     assert message in refusal(make)
+
+
+def test_a_delay_is_shorter_than_an_episode():
+    """15 steps: half a second of approach and a second of a loop, 0.1 s each."""
+    plain = with_fields(config_of("track_circle"), approach_s=0.5, loop_s=1.0)
+    assert make_task("track_circle", with_fields(plain, delay=14)).steps == 15
+    told = refusal(lambda: make_task("track_circle", with_fields(plain, delay=15)))
+    assert "track_circle: world.randomisation.delay is 15 in episodes of 15 steps; expec" in told
+
+
+def test_the_largest_gain_leaves_few_chambers_that_move_the_arm_backwards():
+    """Of normal numbers as the worlds draw them."""
+    vary = Randomisation(gain=LARGEST_GAIN)
+    _, normal = streams(0, 500_000).normal(1)
+    backwards = float((1.0 + vary.gain * normal < 0.0).float().mean())
+    assert backwards == pytest.approx(NormalDist().cdf(-1.0 / LARGEST_GAIN), rel=0.2)
+    assert backwards < 1.0 / 2000.0
 
 
 OWN_ARM = """

@@ -76,6 +76,11 @@ def played(episodes, count, steps, seed=0):
 
 
 @every_task
+def test_the_configuration_of_a_task_is_whole(name):
+    assert task_of(name).config == config_of(name)
+
+
+@every_task
 def test_a_batch_of_n_is_n_batches_of_one(name):
     """To rounding: matrix products of other sizes add up in another order; a beam has a lever."""
     episodes = Episodes(task_of(name))
@@ -362,7 +367,7 @@ def test_the_predicted_error_is_that_of_a_step_without_action():
     episodes = Episodes(task)
     state, _, _ = played(episodes, 64, task.approach + 10)
     assert (task.target_mm(state, 1) - task.target_mm(state)).norm(dim=1).min() > 0.1
-    predicted = episodes.observe(state)["arm"][:, 27:30].sinh() * task.config.fine_mm
+    predicted = episodes.observe(state)["arm"][:, 27:30].sinh() * task.config.follow.fine_mm
     after, _ = episodes.step(state, {"arm": torch.zeros(64, 3)})
     tip = after.world.arms["arm"].points_mm[:, -1]
     torch.testing.assert_close(predicted, task.target_mm(after) - tip, rtol=1e-4, atol=1e-4)
@@ -606,7 +611,7 @@ def test_the_fine_term_has_its_own_scale():
     task = make_task("track_circle")
     state = Episodes(task).seeded(0, 4)
     error, reward = task.error_mm(state), task.rewards(state)["arm"]
-    near = task.config.fine_mm
+    near = task.config.follow.fine_mm
     assert near != 1.0
     torch.testing.assert_close(reward["track"], torch.exp(-error))
     torch.testing.assert_close(reward["fine"], torch.exp(-error / near))

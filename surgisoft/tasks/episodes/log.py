@@ -13,7 +13,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from torch import Tensor
 
-from surgisoft.tasks.base import DONE, TIME_OUT, Outcome, Task, TaskState
+from surgisoft.tasks.base import (
+    DONE,
+    TIME_OUT,
+    Outcome,
+    Task,
+    TaskState,
+    check_measures,
+    trace_of,
+)
 from surgisoft.tasks.episodes.parts import (
     ArmLog,
     BeamLog,
@@ -195,7 +203,9 @@ class EpisodeRecorder:
         lesion = state.world.scene.lesion
         self._lesion = 0 if lesion is None else int(self._of(lesion))
         self._ending = ""
-        self._add(state, task.measures(state), {}, {})
+        measures = task.measures(state)
+        check_measures(task, measures, len(state.world.failed))
+        self._add(state, measures, {}, {})
 
     def step(
         self,
@@ -258,7 +268,7 @@ class EpisodeRecorder:
         return tensor[self.environment].detach().cpu().numpy().copy()
 
     def _add(self, state: TaskState, measures, actions, terms) -> None:
-        targets, actuals = self.task.trace(state)
+        targets, actuals = trace_of(self.task, state)
         row = {"targets": targets, "actuals": actuals}
         for name, part in state.world.arms.items():
             row |= {f"{name}/{field}": getattr(part, field) for field in _ARM_ROWS}

@@ -86,6 +86,11 @@ class Pneumatics:
         return pressure + (wanted - pressure) / self.share(dt_s) - command
 
 
+LARGEST_GAIN = 0.3
+"""Largest standard deviation of the gains, no unit: of normal numbers one in 2,300 is then below
+-1 / 0.3, where a chamber moves the arm backwards; with 1 it is every sixth."""
+
+
 @dataclass(frozen=True)
 class Randomisation:
     """Domain randomization: what differs between episodes. 0 switches an entry off."""
@@ -101,7 +106,7 @@ class Randomisation:
     """Standard deviation of a mount's rotation about each axis of its base, rad."""
     gain: float = 0.0
     """Standard deviation of the factor between a chamber's pressure and the model's input, no
-    unit."""
+    unit; at most 0.3."""
     effects_mm: float = 0.0
     """Largest size of the effect out of the library that an episode's arm has and its model lacks:
     root mean square displacement of the tip, mm. Each episode draws the kind and the size."""
@@ -110,7 +115,8 @@ class Randomisation:
     noise_kPa: float = 0.0
     """Standard deviation of the noise on a measured pressure, kPa."""
     delay: int = 0
-    """Largest action delay, steps; each episode draws a whole number from 0 to this."""
+    """Largest action delay, steps, less than an episode has; each episode draws a whole number from
+    0 to this."""
     lesion_mm: float = 0.0
     """Largest distance of an episode's lesion from the scene's own, along the organ's surface, mm;
     for tasks in a scene."""
@@ -126,6 +132,11 @@ class Randomisation:
         for name, value in vars(self).items():
             if not (math.isfinite(value) and value >= 0):
                 raise InputError(f"randomisation: {name} is {value}, expected 0 or more")
+        if self.gain > LARGEST_GAIN:
+            raise InputError(
+                f"randomisation: gain is {self.gain:g}, expected at most {LARGEST_GAIN:g} (0.05 is "
+                "5 %); with more, some chambers of some episodes would move the arm backwards"
+            )
 
 
 @dataclass(frozen=True, eq=False)

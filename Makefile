@@ -44,7 +44,7 @@ demo: $(STAMP)  ## train two arms to cut a ring, replay it; find the effect that
 	$(BIN)/surgisoft diagnose default demo/bench.parquet --report demo/diagnosis
 	$(BIN)/surgisoft amend default --effect creep --data demo/bench.parquet -o demo/amended --force
 	@echo "Look at demo/compare/report.html and demo/diagnosis/diagnosis.html;"
-	@echo "see the cut with: $(BIN)/surgisoft replay demo/ring.rrd --web"
+	@echo "see the cut with: $(BIN)/surgisoft replay demo/ring-ring.rrd --web"
 	@echo "Lines with 'next: surgisoft ...' above run as $(BIN)/surgisoft ..., or after: source $(BIN)/activate"
 
 test: $(STAMP)  ## the whole suite

@@ -111,7 +111,7 @@ def evaluate(
     --replay FILE.rrd writes the first episode; of several policies one FILE-POLICY.rrd each.
     """
     check_free(json_file, "policies", "drivers")
-    replays = _replays(policies, replay)
+    replays = replay_files(policies, replay)
     for path in replays.values():
         check_replay(path)
     check_folder(report)
@@ -189,7 +189,7 @@ def evaluate(
         raise typer.Exit(INTERRUPTED)
 
 
-def _replays(policies: list[str], replay: Path | None) -> dict[str, Path]:
+def replay_files(policies: list[str], replay: Path | None) -> dict[str, Path]:
     """Policy -> the file of its replay: the given one, or NAME-POLICY.rrd of several policies."""
     names = list(dict.fromkeys(policies))
     if replay is None:

@@ -23,6 +23,9 @@ WORDS = {
 UNITS = {"_mm": "mm", "_mm2": "mm²", "_s": "s"}
 """Unit of a number by the end of its name."""
 HOW = WHAT_CELLS_ARE + (
+    "Errors are over the steps at which the task measures one: not over the time at the beginning "
+    "in which the reference waits for the arm (`approach_s` of the task, grey in the charts of "
+    "the error over time). "
     "The beam's error is the distance of its axis from its target while it is on. "
     "Clearance, contact and success come from exact collision checks (FCL) where there is a scene."
 )

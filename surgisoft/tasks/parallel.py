@@ -32,8 +32,10 @@ class SurgicalEnv(ParallelEnv):
     Actions are changes of the commanded pressure (m,) float32, kPa. Observations are (D,) float32;
     `surgisoft.tasks.describe` lists their entries; with images they are dicts of that `vector` and
     of (H, W, C) arrays. Each agent's info holds its weighted reward
-    terms, the task's measures where they apply, and `failed`: whether the episode ended because an
-    arm was no longer finite, as after an action of NaN.
+    terms, the task's measures that apply, and `failed`: whether the episode ended because an
+    arm was no longer finite, as after an action of NaN. A measure that does not apply at a step,
+    such as the error while the reference waits, is left out, since NaN does not equal itself and
+    PettingZoo's test of seeds compares infos.
     """
 
     def __init__(self, task: Task, render_mode: str | None = None):

@@ -105,7 +105,9 @@ class SingleEnv(gymnasium.Env):
     """One environment of a task. Actions (m,) kPa and observations (D,) are float32.
 
     The info of a step holds the weighted reward terms, the measures that apply, and `failed`:
-    whether the episode ended because the arm was no longer finite, as after an action of NaN.
+    whether the episode ended because the arm was no longer finite, as after an action of NaN. A
+    measure that does not apply at a step, such as the error while the reference waits, is left out:
+    `info.get("error_mm")` is then None.
     """
 
     metadata = {"render_modes": [RGB_ARRAY], "render_fps": 10}  # noqa: RUF012  (Gymnasium's form)

@@ -199,6 +199,32 @@ def test_a_nan_action_ends_one_environment_only():
     assert not many.step(np.zeros((3, 3), np.float32))[2].any()
 
 
+@pytest.mark.parametrize("name", ["track_circle", "circle_ablation"])
+def test_infos_have_the_measures_that_apply(name):
+    """Those that a batch has as numbers: not the error while the reference waits for 0.5 s, nor
+    that of a beam that is off."""
+    config = SHORT if name == "track_circle" else None
+    measure = "error_mm" if name == "track_circle" else "beam_error_mm"
+    batch, env = surgisoft.batched_env(name, 1, config=config, seed=4), parallel_env(name, config)
+    env.reset(seed=4)
+    still = {agent: np.zeros(3, np.float32) for agent in env.possible_agents}
+    one, many = [], []
+    for _ in range(8):
+        *_, infos = env.step(still)
+        step = batch.step({agent: value[None] for agent, value in still.items()})
+        known = {key for key, value in step.measures.items() if value.isfinite().all()}
+        for info in infos.values():
+            assert set(step.measures) & set(info) == known
+        one.append(infos[env.possible_agents[0]].get(measure))
+        many.append(step.measures[measure].item())
+    assert [value is None for value in one] == [name != "track_circle" or k < 5 for k in range(8)]
+    np.testing.assert_allclose(np.array(one, float), many, rtol=1e-3)
+    if name == "track_circle":
+        single = SingleEnv(name, config)
+        single.reset(seed=4)
+        assert measure not in single.step(np.zeros(3, np.float32))[-1]
+
+
 @pytest.mark.parametrize("geometry", ["fcl", "batched"])
 @pytest.mark.parametrize("name", ["track_circle", "circle_ablation"])
 def test_infos_say_that_a_nan_action_ended_the_episode(name, geometry):

@@ -21,6 +21,7 @@ from surgisoft.tasks.numpy_adapter import (
     NumpyAdapter,
     Pictures,
     entropy_seed,
+    episode_number,
     in_one,
 )
 from surgisoft.tasks.registry import task_of
@@ -84,13 +85,16 @@ class SurgicalEnv(ParallelEnv):
     def reset(self, seed: int | None = None, options: dict | None = None):
         """Start an episode; returns observations and empty infos.
 
-        Without a seed the random number stream of the last episode continues.
+        Without a seed the random number stream of the last episode continues. options:
+        `{"episode": k}` starts episode k of the seed, as `surgisoft evaluate` counts them; default
+        0.
         """
-        state = self.task_state
+        state, number = self.task_state, episode_number(seed, options)
         if seed is None and state is not None:
             self._batch = self.adapter.restart(state)
         else:
-            self._batch = self.adapter.seeded([entropy_seed() if seed is None else seed])
+            first = entropy_seed() if seed is None else seed
+            self._batch = self.adapter.seeded([first], number)
         self.lone = self.adapter.alone(self._batch)
         self.agents = list(self.possible_agents)
         return self._observations(), {agent: {} for agent in self.agents}

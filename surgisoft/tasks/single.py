@@ -28,6 +28,7 @@ from surgisoft.tasks.numpy_adapter import (
     NumpyAdapter,
     Pictures,
     entropy_seed,
+    episode_number,
     in_one,
 )
 from surgisoft.tasks.observations import ObservationBlocks
@@ -142,11 +143,16 @@ class SingleEnv(gymnasium.Env):
         self.action_space = Box(*self.adapter.action_bounds(self._agent))
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """Start an episode; returns (observation, empty info)."""
+        """Start an episode; returns (observation, empty info).
+
+        options: `{"episode": k}` starts episode k of the seed, as `surgisoft evaluate` counts them;
+        default 0.
+        """
+        number = episode_number(seed, options)
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(2**63))
-        self._state = self.adapter.seeded([seed])
+        self._state = self.adapter.seeded([seed], number)
         return in_one(self.adapter.observations(self._state)[self._agent]), {}
 
     def step(self, action: np.ndarray):

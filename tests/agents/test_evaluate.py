@@ -24,10 +24,10 @@ from surgisoft.agents.evaluate import (
 )
 from surgisoft.agents.exact_checks import Contact, EpisodeCheck
 from surgisoft.agents.rollout import Rollout
-from surgisoft.agents.run_folder import PACKAGED
+from surgisoft.agents.run_folder import PACKAGED, RunFolder
 from surgisoft.agents.session import EvaluationRequest, evaluate
 from surgisoft.cli import run
-from surgisoft.errors import Interrupted
+from surgisoft.errors import InputError, Interrupted
 from surgisoft.scene.folder import open_scene
 from surgisoft.scene.spec import PHANTOM
 from surgisoft.surrogate.checkpoint import load_model, save_model
@@ -407,3 +407,27 @@ def test_the_command_imports_nothing_of_pictures_and_training():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "['torch']"
+
+
+def test_the_block_of_the_page_drives_the_episodes_of_evaluate(tmp_path, monkeypatch):
+    """docs/evaluate.md as it stands: episodes 0 and 1 of seed 7, here of a faster ring."""
+    page = (Path(__file__).parents[2] / "docs" / "evaluate.md").read_text()
+    (block,) = re.findall(r"^```python\n(.*?)^```", page, re.S | re.M)
+    packaged = RunFolder("ring")
+    shutil.copytree(packaged.path, tmp_path / "runs" / "ring")
+    quick = replace(packaged.plan().task_config, cut_s=10.0)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(RunFolder, "task", lambda run: make_task("circle_ablation", quick))
+    names = {}
+    exec(block, names)
+    found = evaluate("runs/ring", config=quick, episodes=2, seed=7, exact_checks=False)
+    expected = found.results[0].per_episode["beam_error_mean_mm"]
+    np.testing.assert_allclose(names["errors"], expected, rtol=0.01)
+    assert abs(expected[1] - expected[0]) > 0.02 * expected[0], "two episodes"
+    policy, seen = names["policy"], names["seen"]
+    both = policy.actions({"laser": np.stack([seen["laser"]] * 2)})["laser"]
+    np.testing.assert_allclose(both, [policy.actions(seen)["laser"]] * 2, atol=1e-5)
+    with pytest.raises(InputError, match=r"'laser' has shape \(3,\), expected \(\d+,\) or"):
+        policy.actions({"laser": np.zeros(3)})
+    with pytest.raises(InputError, match=r"unknown agent 'lazer'.*did you mean 'laser'"):
+        policy.actions({"lazer": seen["laser"]})

@@ -37,7 +37,9 @@ def test_a_missing_replay_is_told_with_those_of_its_name(tmp_path, there, hint):
         (tmp_path / name).write_bytes(MAGIC)
     with pytest.raises(InputError) as told:
         find_replay(tmp_path / "ring.rrd")
-    missing = f"{tmp_path / 'ring.rrd'}: there is no such file or folder; expected a replay or a run"
+    missing = (
+        f"{tmp_path / 'ring.rrd'}: there is no such file or folder; expected a replay or a run"
+    )
     more = f"; did you mean {tmp_path}/{hint.format(tmp_path)}" if hint else ""
     assert str(told.value) == missing + more
 

@@ -19,9 +19,10 @@ from surgisoft.scene.batched import BatchedScene, LoneScene
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import CollisionChecker, ExactScene, LoneExact
 from surgisoft.scene.spec import PHANTOM
+from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.parallel import SurgicalEnv, parallel_env
 from surgisoft.tasks.path_following import FollowConfig
-from surgisoft.tasks.registry import TASKS
+from surgisoft.tasks.registry import TASKS, make_task
 from surgisoft.tasks.single import BatchedEnv, SingleEnv
 from surgisoft.tasks.track import TrackConfig
 
@@ -137,6 +138,25 @@ def test_a_reset_without_a_seed_is_another_episode():
     one, _ = parallel_env("track_circle").reset()
     other, _ = parallel_env("track_circle").reset()
     assert not np.array_equal(one["arm"], other["arm"])
+
+
+def test_the_option_episode_starts_that_episode_of_the_seed():
+    """As the streams of a rollout are counted: episode 3 of seed 7, which no other seed has."""
+    task = make_task("track_circle")
+    episodes = Episodes(task)
+    expected = episodes.observe(episodes.seeded(7, 4))["arm"].numpy()
+    env, single = SurgicalEnv(task), SingleEnv(task)
+    for number in (0, 3):
+        seen, _ = env.reset(seed=7, options={"episode": number})
+        np.testing.assert_allclose(seen["arm"], expected[number], atol=1e-5)
+        seen, _ = single.reset(seed=7, options={"episode": number})
+        np.testing.assert_allclose(seen, expected[number], atol=1e-5)
+    assert np.abs(env.reset(seed=10)[0]["arm"] - expected[3]).max() > 1e-3
+    for one in (env, single):
+        with pytest.raises(InputError, match="option 'episode' is -1, expected 0 or more"):
+            one.reset(seed=7, options={"episode": -1})
+        with pytest.raises(InputError, match="option 'episode' is 2 without a seed; expected both"):
+            one.reset(options={"episode": 2})
 
 
 @one_arm

@@ -770,24 +770,50 @@ def test_an_export_without_a_controller_says_why(tmp_path, capsys, monkeypatch):
     assert out.endswith(f"wrote {tmp_path / 'policy.onnx'}\n")
     assert run(["export", "runs/x", "-o", str(tmp_path), "--check"]) == 1, "what was asked for"
     assert "not exported" in capsys.readouterr().out
-    (tmp_path / "controller.py").touch()
-    monkeypatch.setattr("surgisoft.agents.controller_runner.Controller", lambda folder: None)
+
+
+def test_the_check_of_an_export_says_what_was_compared_and_keeps_no_wrong_file(
+    tmp_path, capsys, monkeypatch
+):
+    run_of = SimpleNamespace(task=lambda: None)
+    monkeypatch.setattr(
+        "surgisoft.agents.learned.LearnedPolicy", lambda *_, **__: SimpleNamespace(run=run_of)
+    )
+
+    def exported(policy, output, task, force, check):
+        check(None)
+        (tmp_path / "controller.py").touch()
+        return [tmp_path / "policy.onnx"]
+
+    monkeypatch.setattr("surgisoft.agents.export.export", exported)
     right, far = Differences(1.5e-5, 0.00013), Differences(0.35, 1.1)
-    itself = Differences(0.29, 1.4)
     for check, code, told in (
-        (RigCheck(right, Differences(3e-5, 9e-5), 30), 0, "true key points 3e-05 mm\nwrote"),
-        (RigCheck(right, far, 456, itself), 0, "the policy differs as much from itself\nwrote"),
-        (RigCheck(right, far, 456, itself, 0.00013), 0, "moved at random by up to 0.00013 kPa: "),
-        (RigCheck(right, far, 456, right, 0.00013), 1, "what the policy does not do\nwrote"),
-        (RigCheck(far, far, 456, itself), 1, "does not compute what the policy computes\nwrote"),
+        (RigCheck(right, Differences(3e-5, 9e-5), 30), 0, "does in the loop what the policy does"),
+        (RigCheck(right, far, 456, right), 0, "because the robot amplifies rounding"),
+        (RigCheck(right, far, 456, far), 1, "given the measurements of its own closed loop, "),
+        (RigCheck(far, far, 456), 1, "given the measurements of the policy's episode, "),
     ):
+        (tmp_path / "controller.py").unlink(missing_ok=True)
         monkeypatch.setattr("surgisoft.agents.rig_check.check_on_rig", lambda *_, it=check: it)
         assert run(["export", "runs/x", "-o", str(tmp_path), "--check"]) == code
-        out = capsys.readouterr().out
-        assert f"same measurements: commands {check.same.commands_kPa:.2g} kPa, estimated" in out
-        assert f"closed loop: commands {check.closed.commands_kPa:.2g} kPa, true key" in out
-        assert told in out
-    assert out.endswith(f"wrote {tmp_path / 'policy.onnx'}\n")
+        *numbers, verdict, last = capsys.readouterr().out.splitlines()
+        assert numbers[1].startswith(
+            f"same measurements: commands {check.same.commands_kPa:.2g} kPa, estimated key points "
+        )
+        assert numbers[2] == (
+            f"closed loop: commands {check.closed.commands_kPa:.2g} kPa, true key points "
+            f"{check.closed.points_mm:.2g} mm"
+        )
+        if check.own is not None:
+            assert numbers[3].endswith(
+                f"closed loop: commands {check.own.commands_kPa:.2g} kPa, estimated key points "
+                f"{check.own.points_mm:.2g} mm"
+            )
+        assert verdict.startswith("failed: " if code else "passed: ")
+        assert told in verdict
+        wrote = f"wrote {tmp_path / 'policy.onnx'}"
+        assert last.startswith(f"no file was written to {tmp_path}; without" if code else wrote)
+        assert (tmp_path / "controller.py").exists() == (code == 0)
 
 
 def test_an_interrupted_recording_says_where_its_log_is(tmp_path, capsys, monkeypatch):

@@ -75,7 +75,7 @@ def evaluation_page(
         about=about,
         tone=_tone(results),
         parts=[
-            Facts(_facts(best)),
+            Facts(_facts(best) if len(results) == 1 else _facts_of_each(results, words)),
             Section("All numbers", [Table(header, rows)]),
             *_paired(results, words),
             *([Section("Every episode", [Gallery(_spreads(results))])] if several else []),
@@ -176,6 +176,19 @@ def _facts(result: Evaluation) -> list[tuple[str, str]]:
             text = f"{value.mean:.0%}" if name in (*RATES, "completion") else f"{value.mean:.3g}"
             items.append((in_words(name), text))
     return [*items, *_error(result)]
+
+
+def _facts_of_each(
+    results: Sequence[Evaluation], words: Mapping[str, str]
+) -> list[tuple[str, str]]:
+    """Success and error of several policies: a policy may be behind another one in either."""
+    items = []
+    for result in results:
+        success = result.overall.get("success")
+        if success is not None and success.episodes:
+            items.append((f"{words[result.policy]}: success", f"{success.mean:.0%}"))
+        items += [(f"{words[result.policy]}: {title}", text) for title, text in _error(result)]
+    return items
 
 
 def _spreads(results: Sequence[Evaluation]) -> list[Picture]:

@@ -23,6 +23,9 @@ MAP_CELL_MM = 0.25
 """Least size of a cell of the dose map (mm); coarser where the samples are."""
 MOST_TICKS = 6
 """Most intervals between the ticks of an axis whose labels stand side by side."""
+DECADES = 100.0
+"""Ratio of the largest to the smallest length of all episodes from which its axis is logarithmic.
+"""
 PLAIN_POWERS = (-3, 4)
 """Powers of ten whose numbers are written out at an axis; others have a common factor."""
 RESTING_MM = 0.05
@@ -279,8 +282,13 @@ def spread_chart(
         every = np.concatenate([values for _, values in known])
         if "[" not in label and every.min() >= 0.0 and every.max() <= 1.0:  # a share
             axis.set_xlim(-0.02, 1.02)
-        axis.locator_params(axis="x", nbins=MOST_TICKS)
-        axis.ticklabel_format(axis="x", scilimits=PLAIN_POWERS, useOffset=False, useMathText=True)
+        if "[mm]" in label and 0.0 < every.min() <= every.max() / DECADES:
+            axis.set_xscale("log")
+        else:
+            axis.locator_params(axis="x", nbins=MOST_TICKS)
+            axis.ticklabel_format(
+                axis="x", scilimits=PLAIN_POWERS, useOffset=False, useMathText=True
+            )
         axis.set_xlabel(label)
         if title != label:
             axis.set_title(title)

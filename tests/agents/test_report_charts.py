@@ -117,6 +117,16 @@ def test_targets_in_turn_are_points_and_the_way_between_them_has_no_gap(monkeypa
     assert len(axis.lines) == 2, "one that moves has no such points"
 
 
+def test_lengths_over_several_decades_have_a_logarithmic_axis(monkeypatch):
+    """A learned policy beside the expert: their errors would lie on one spot at 0."""
+    groups = [("tc1", [5.0, 7.5]), ("scripted", [3.6e-6, 4.0e-6])]
+    axis, _ = drawn(monkeypatch, lambda: spread_chart("error", groups, "error mean [mm]"))
+    assert axis.get_xscale() == "log"
+    for label, values in (("error mean [mm]", [0.2, 5.0]), ("reward", [1e-6, 5.0])):
+        axis, _ = drawn(monkeypatch, lambda v=values, x=label: spread_chart(x, [("a", v)], x))
+        assert axis.get_xscale() == "linear"
+
+
 def test_shares_are_drawn_from_0_to_1(monkeypatch):
     groups = [("a", [1.0, 1.0]), ("b", [1.0])]
     share, _ = drawn(monkeypatch, lambda: spread_chart("share cut", groups, "share cut"))

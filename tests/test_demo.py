@@ -148,12 +148,3 @@ def test_the_replay_that_make_demo_names_is_one_that_it_writes():
     named = re.findall(r"surgisoft replay (\S+)", makefile)
     assert given.split() == ["demo/ring", "scripted", "random"]
     assert [Path(name) for name in named] == [replay_files(given.split(), Path(file))["demo/ring"]]
-
-
-def test_replays_of_runs_with_one_folder_name_are_told_apart():
-    names = ["a/run", "b/run", "scripted", "a/run/"]
-    files = replay_files(names, Path("x/ab.rrd"))
-    assert [path.as_posix() for path in files.values()] == [
-        *("x/ab-a-run.rrd", "x/ab-b-run.rrd", "x/ab-scripted.rrd"),
-    ]
-    assert replay_files(["a/run", "a/run"], Path("ab.rrd")) == {"a/run": Path("ab.rrd")}

@@ -134,10 +134,12 @@ def test_evaluate_prints_a_column_for_each_policy(capsys, monkeypatch):
     scripted = SimpleNamespace(
         policy="scripted", overall={"success": summary(0.5), "error_mm": summary(0.25)},
         checks=object(), to_json=lambda: {"exact_checks": facts},
+        per_episode={"error_mean_mm": np.full(6, 0.25)}, episodes=6,
     )  # fmt: skip
     learned = SimpleNamespace(
-        policy="runs/ring", overall={"success": summary(NAN, 0)}, checks=None, to_json=dict
-    )
+        policy="runs/ring", overall={"success": summary(NAN, 0)}, checks=None, to_json=dict,
+        per_episode={"error_mean_mm": np.array([1.0, 1.5] * 3)}, episodes=6,
+    )  # fmt: skip
     found = result(
         task="track_circle", results=[scripted, learned], success_rule="within 1 mm",
         measured_arms=("arm",), logs={}, request=SimpleNamespace(seed=4),
@@ -149,6 +151,8 @@ def test_evaluate_prints_a_column_for_each_policy(capsys, monkeypatch):
     assert re.search(r"^ +scripted +ring\n", out, re.M)
     assert re.search(r"success +50\.0% \[40\.0%, 60\.0%\] +-\n", out)
     assert re.search(r"error_mm +0\.25 \[0\.15, 0\.35\] +-\n", out)
+    # Student's interval of 0.75 and 1.25, three times each: 1 +- 2.5706 * sqrt(0.075 / 6)
+    assert "ring minus scripted, episode by episode: error_mean_mm 1 [0.7126, 1.287]\n" in out
     assert "of 10 instants the batched geometry differs on contact in 1 and on what the" in out
     assert "success: within 1 mm\n" in out
     assert "arm: on a real bench, whose true body is not known" in out
@@ -978,13 +982,14 @@ def test_each_policy_has_a_replay_of_its_own(tmp_path, capsys, monkeypatch):
     assert asked == [names]
     assert made == {
         "r.v2-scripted.rrd": "log of scripted",
-        "r.v2-run.rrd": "log of a/run",
-        "r.v2-run-3.rrd": "log of b/run",
+        "r.v2-a-run.rrd": "log of a/run",
+        "r.v2-b-run.rrd": "log of b/run",
     }
-    assert f"wrote {tmp_path / 'r.v2-run-3.rrd'}" in capsys.readouterr().out
-    made.clear()
-    assert run(["evaluate", "scripted", "--task", "track_circle", "--replay", file]) == 0
-    assert made == {"r.v2.rrd": "log of scripted"}
+    assert f"wrote {tmp_path / 'r.v2-b-run.rrd'}" in capsys.readouterr().out
+    for one in (["scripted"], ["scripted", "scripted"]):
+        made.clear()
+        assert run(["evaluate", *one, "--task", "track_circle", "--replay", file]) == 0
+        assert made == {"r.v2.rrd": "log of scripted"}
 
 
 def test_a_file_given_twice_is_in_the_next_command_once(bench, capsys, monkeypatch):

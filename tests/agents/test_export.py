@@ -331,6 +331,10 @@ def test_a_loop_that_departs_by_rounding_passes_and_one_by_a_wrong_controller_do
     assert closed.points_mm > 200.0 * TOLERANCE_MM
     build = replaying(rigs, ten_pictures_a_second)
     beside = drive(task, policy, replace(STRANGE, noise=1.0), build=build)
+    pressures, points = beside.measured(row := beside.settled + 100)
+    for name, rig in rigs.items():
+        np.testing.assert_array_equal(pressures[name], rig.samples[row][0].measured)
+        np.testing.assert_array_equal(points[name], rig.samples[row][0].key_points_mm)
     own = same_measurements(moved, beside)
     assert RigCheck(Differences(0.0, 0.0), closed, episode.decisions, own).passed == (not later_kPa)
     assert own.commands_kPa == pytest.approx(later_kPa, abs=TOLERANCE_KPA)

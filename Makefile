@@ -6,6 +6,9 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DOCS_STAMP := $(VENV)/.installed-docs
 
+# Newer versions of setuptools warn in a box of folders that have the name of an editable package.
+EDITABLE := "ignore:Editable installation"
+
 # Without bytecode each process that a test starts, and each of pytest's workers, compiles all modules.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -16,7 +19,7 @@ $(STAMP): pyproject.toml requirements.lock
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --no-deps "$(TORCH)"
 	$(BIN)/python -m pip install --quiet --require-hashes --no-deps -r requirements.lock
-	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation -e .
+	PYTHONWARNINGS=$(EDITABLE) $(BIN)/python -m pip install --quiet --no-deps --no-build-isolation -e .
 	touch $@
 
 $(DOCS_STAMP): $(STAMP)
@@ -26,11 +29,11 @@ $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip setuptools -c constraints.txt
 	$(BIN)/python -m pip install --quiet -c constraints.txt "$(TORCH)"
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[dev]"
+	PYTHONWARNINGS=$(EDITABLE) $(BIN)/python -m pip install --quiet -c constraints.txt -e ".[dev]"
 	touch $@
 
 $(DOCS_STAMP): $(STAMP)
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[docs]"
+	PYTHONWARNINGS=$(EDITABLE) $(BIN)/python -m pip install --quiet -c constraints.txt -e ".[docs]"
 	touch $@
 endif
 
@@ -44,7 +47,7 @@ demo: $(STAMP)  ## train two arms to cut a ring, replay it; find the effect that
 	$(BIN)/surgisoft diagnose default demo/bench.parquet --report demo/diagnosis
 	$(BIN)/surgisoft amend default --effect creep --data demo/bench.parquet -o demo/amended --force
 	@echo "Look at demo/compare/report.html and demo/diagnosis/diagnosis.html;"
-	@echo "see the cut with: $(BIN)/surgisoft replay demo/ring.rrd --web"
+	@echo "see the cut with: $(BIN)/surgisoft replay demo/ring-ring.rrd --web"
 	@echo "Lines with 'next: surgisoft ...' above run as $(BIN)/surgisoft ..., or after: source $(BIN)/activate"
 
 test: $(STAMP)  ## the whole suite

@@ -1,9 +1,11 @@
 """The demonstration: five steps, each with its result on the page and its files."""
 
 import base64
+import re
 import time
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -12,6 +14,7 @@ from PIL import Image
 from surgisoft.agents.run_folder import RunFolder
 from surgisoft.agents.session import evaluate
 from surgisoft.cli import run
+from surgisoft.cli.evaluate import replay_files
 from surgisoft.demonstration import story
 from surgisoft.errors import InputError
 from surgisoft.files import write_atomically
@@ -136,3 +139,12 @@ def test_ctrl_c_names_what_is_complete_and_leaves_its_page(tmp_path, monkeypatch
     page = (folder / "index.html").read_text()
     assert page.count("<section") == 1
     assert "ended before the next step (4 of 5 are left)" in page
+
+
+def test_the_replay_that_make_demo_names_is_one_that_it_writes():
+    """Its `evaluate --replay` has three policies, each with its own file."""
+    makefile = (Path(__file__).resolve().parents[1] / "Makefile").read_text()
+    given, file = re.findall(r"surgisoft evaluate (.*?) --.* --replay (\S+)", makefile)[0]
+    named = re.findall(r"surgisoft replay (\S+)", makefile)
+    assert given.split() == ["demo/ring", "scripted", "random"]
+    assert [Path(name) for name in named] == [replay_files(given.split(), Path(file))["demo/ring"]]

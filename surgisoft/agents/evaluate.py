@@ -223,6 +223,31 @@ def summary(name: str, values: np.ndarray) -> Summary:
     return Summary(float(known.mean()), float(low), float(high), *ends, len(known))
 
 
+def differences(first: Evaluation, other: Evaluation) -> dict[str, Summary]:
+    """Numbers of another policy minus those of the first, over the episodes that both have.
+
+    name with unit -> mean of the N differences, one for each episode, with Student's (1908)
+    interval of paired samples: what episodes have in common, such as their goals, is not in it.
+    Rates are left out.
+    """
+    count = min(first.episodes, other.episodes)
+    found = {}
+    for name, values in first.per_episode.items():
+        if name in other.per_episode and name not in RATES:
+            apart = other.per_episode[name][:count] - values[:count]
+            found[name] = _plain_summary(apart[np.isfinite(apart)])
+    return found
+
+
+def _plain_summary(known: np.ndarray) -> Summary:
+    """Mean of (N,) finite numbers of any sign, with Student's interval."""
+    if not len(known):
+        return Summary(*(math.nan,) * 5, 0)
+    return Summary(
+        float(known.mean()), *student(known), float(known.min()), float(known.max()), len(known)
+    )
+
+
 def _range(name: str) -> tuple[float, float]:
     """Least and largest value that a number of that name can have."""
     if name in SHARES:

@@ -12,7 +12,7 @@ graph can have, `controller_code.py` is in their place: NumPy code that calls it
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -75,11 +75,14 @@ def export(
     task: Task | None = None,
     gains: ObserverGains | None = None,
     force: bool = False,
+    check: Callable[[Controller], None] | None = None,
 ) -> list[Path]:
     """Write a policy for other programs, each file checked against the policy; returns the files.
 
     task: where the policy acts, None: the task of its run. gains: of the observer. force: replace
-    an earlier export of a policy. Raises InputError where the folder is in use.
+    an earlier export of a policy. check: is called with the exported controller, where there is
+    one, before the files are in their place: what it raises leaves the folder as it was. Raises
+    InputError where the folder is in use.
     """
     check_export_folder(folder, ABOUT, force)
     task = task or policy.run.task()
@@ -110,6 +113,8 @@ def export(
             for file in [*fresh.glob("controller.*"), fresh / CODE]:  # what was written of it
                 file.unlink(missing_ok=True)
         write_json(fresh / ABOUT, content)
+        if check is not None and content["controller"] is not None:
+            check(Controller(fresh))
         names = [*(file.name for file in written), ABOUT]
     return [folder / name for name in names]
 

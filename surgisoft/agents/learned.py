@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -60,6 +61,29 @@ class LearnedPolicy(ActorPolicy):
         super().__init__(actors)
         if task is not None:
             check_fits(self.run, task)
+
+    @torch.inference_mode()
+    def actions(self, observations: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Actions for the observations of environments: agent -> (m,) or (B, m) float32, kPa.
+
+        observations: agent -> (D,) or (B, D), as `parallel_env` gives them. Raises InputError for
+        an agent that was not trained, and for another width.
+        """
+        found = {}
+        for agent, given in observations.items():
+            if agent not in self.actors:
+                raise unknown_name("agent", agent, self.actors)
+            actor, seen = self.actors[agent], np.asarray(given, np.float32)
+            width = self.run.agents[agent]["observation"]
+            if seen.shape[-1:] != (width,):
+                raise InputError(
+                    f"observation of '{agent}' has shape {seen.shape}, expected ({width},) or "
+                    f"(B, {width})"
+                )
+            device = next(actor.parameters()).device
+            rows = torch.from_numpy(seen.reshape(-1, width)).to(device)
+            found[agent] = actor(rows).cpu().numpy().reshape(*seen.shape[:-1], -1)
+        return found
 
 
 def check_weights(

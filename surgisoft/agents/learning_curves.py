@@ -9,6 +9,7 @@ from pathlib import Path
 
 from matplotlib import pyplot as plt
 
+from surgisoft.agents.policy_names import short_names
 from surgisoft.agents.run_folder import RunFolder
 from surgisoft.palette import model_colour
 from surgisoft.report import Picture
@@ -60,11 +61,8 @@ def learning_curves(runs: Sequence[str | Path]) -> list[Picture]:
 
     runs: folders of training runs, or names of packaged ones.
     """
-    names = [Path(run).name for run in runs]
-    words = [
-        name if names.count(name) == 1 else str(run) for name, run in zip(names, runs, strict=True)
-    ]
-    lines = {word: metrics_of(RunFolder(run)) for word, run in zip(words, runs, strict=True)}
+    words = short_names([str(run) for run in runs])
+    lines = {word: metrics_of(RunFolder(name)) for name, word in words.items()}
     drawn = []
     for name, (label, how) in CURVES.items():
         curves = {

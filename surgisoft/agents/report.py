@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
-from surgisoft.agents.evaluate import RATES, WHAT_CELLS_ARE, Evaluation, cell, cells_are
+from surgisoft.agents.evaluate import (
+    RATES,
+    WHAT_CELLS_ARE,
+    Evaluation,
+    cell,
+    cells_are,
+    differences,
+)
+from surgisoft.agents.policy_names import short_names
 from surgisoft.agents.report_charts import episode_charts, spread_chart
 from surgisoft.errors import counted
 from surgisoft.report import Facts, Gallery, Page, Picture, Section, Table, Text
@@ -22,7 +29,16 @@ WORDS = {
 """Numbers that are drawn for every episode, in words."""
 UNITS = {"_mm": "mm", "_mm2": "mm²", "_s": "s"}
 """Unit of a number by the end of its name."""
+PAIRED = (
+    "All policies have the same episodes, so that each number is subtracted episode by episode; "
+    "the mean of the differences has Student's 95 % interval of paired samples. Where it does not "
+    "contain 0, the policies differ. Rates are left out."
+)
+"""How to read the table of differences."""
 HOW = WHAT_CELLS_ARE + (
+    "Errors are over the steps at which the task measures one: not over the time at the beginning "
+    "in which the reference waits for the arm (`approach_s` of the task, grey in the charts of "
+    "the error over time). "
     "The beam's error is the distance of its axis from its target while it is on. "
     "Clearance, contact and success come from exact collision checks (FCL) where there is a scene."
 )
@@ -41,7 +57,7 @@ def evaluation_page(
 
     curves: learning curves of the policies that were trained, see `learning_curves`.
     """
-    films = films or {}
+    films, words = films or {}, short_names([result.policy for result in results])
     names = list(dict.fromkeys(name for result in results for name in result.overall))
     rows = [
         (in_words(name), *(cell(name, result.overall.get(name)) for result in results))
@@ -49,7 +65,7 @@ def evaluation_page(
     ]
     header = [
         cells_are(result.overall for result in results),
-        *(Path(result.policy).name for result in results),
+        *words.values(),
     ]
     best = next(iter(results))
     several = len(results) > 1 or any(len(rows) > 1 for rows in best.per_episode.values())
@@ -59,13 +75,14 @@ def evaluation_page(
         about=about,
         tone=_tone(results),
         parts=[
-            Facts(_facts(best)),
+            Facts(_facts(best) if len(results) == 1 else _facts_of_each(results, words)),
             Section("All numbers", [Table(header, rows)]),
+            *_paired(results, words),
             *([Section("Every episode", [Gallery(_spreads(results))])] if several else []),
             *([Section("Learning curves", [Gallery(curves)])] if curves else []),
             *(
                 Section(
-                    f"First episode of {Path(name).name}",
+                    f"First episode of {words.get(name, name)}",
                     [*([films[name]] if name in films else []), *episode_parts(log)],
                 )
                 for name, log in logs.items()
@@ -73,6 +90,20 @@ def evaluation_page(
             Section("How to read this", [Text(HOW)]),
         ],
     )
+
+
+def _paired(results: Sequence[Evaluation], words: Mapping[str, str]) -> list[Section]:
+    """How the policies differ from the first one in the same episodes; nothing for one policy."""
+    if len(results) < 2:
+        return []
+    found = {words[other.policy]: differences(results[0], other) for other in results[1:]}
+    names = [name for name in results[0].overall if any(name in each for each in found.values())]
+    rows = [
+        (in_words(name), *(cell(name, each.get(name)) for each in found.values())) for name in names
+    ]
+    first = words[results[0].policy]
+    header = ["", *(f"{word} minus {first}" for word in found)]
+    return [Section(f"Differences from {first}", [Text(PAIRED), Table(header, rows)])]
 
 
 def episode_parts(log: EpisodeLog, charts: Sequence[Picture] | None = None) -> list:
@@ -110,12 +141,12 @@ def in_words(name: str) -> str:
 
 def verdict(task: str, results: Sequence[Evaluation]) -> str:
     """One sentence with each policy's success and error."""
-    parts = []
+    parts, short = [], short_names([result.policy for result in results])
     for result in results:
         success = result.overall.get("success")
         words = [] if success is None else [f"{success.mean:.0%} success"]
         words += [" ".join(stated) for stated in _error(result)]
-        parts.append(f"{Path(result.policy).name}: {', '.join(words) or 'see the table'}")
+        parts.append(f"{short[result.policy]}: {', '.join(words) or 'see the table'}")
     counts = [result.episodes for result in results]
     episodes = f"{counted(counts[0], 'episode')} each"
     if len(set(counts)) > 1:
@@ -138,7 +169,7 @@ def _tone(results: Sequence[Evaluation]) -> str:
 
 
 def _facts(result: Evaluation) -> list[tuple[str, str]]:
-    items = [("policy", Path(result.policy).name)]
+    items = [("policy", short_names([result.policy])[result.policy])]
     for name in ("success", "completion", "collided", "clearance_mm", "time_s"):
         value = result.overall.get(name)
         if value is not None and value.episodes:
@@ -147,12 +178,25 @@ def _facts(result: Evaluation) -> list[tuple[str, str]]:
     return [*items, *_error(result)]
 
 
+def _facts_of_each(
+    results: Sequence[Evaluation], words: Mapping[str, str]
+) -> list[tuple[str, str]]:
+    """Success and error of several policies: a policy may be behind another one in either."""
+    items = []
+    for result in results:
+        success = result.overall.get("success")
+        if success is not None and success.episodes:
+            items.append((f"{words[result.policy]}: success", f"{success.mean:.0%}"))
+        items += [(f"{words[result.policy]}: {title}", text) for title, text in _error(result)]
+    return items
+
+
 def _spreads(results: Sequence[Evaluation]) -> list[Picture]:
     names = [n for n in results[0].per_episode if n in WORDS or n.endswith("error_mean_mm")]
-    drawn = []
+    drawn, short = [], short_names([result.policy for result in results])
     for name in names:
         groups = [
-            (Path(result.policy).name, result.per_episode[name].tolist())
+            (short[result.policy], result.per_episode[name].tolist())
             for result in results
             if name in result.per_episode
         ]

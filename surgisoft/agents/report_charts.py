@@ -23,6 +23,9 @@ MAP_CELL_MM = 0.25
 """Least size of a cell of the dose map (mm); coarser where the samples are."""
 MOST_TICKS = 6
 """Most intervals between the ticks of an axis whose labels stand side by side."""
+DECADES = 100.0
+"""Ratio of the largest to the smallest length of all episodes from which its axis is logarithmic.
+"""
 PLAIN_POWERS = (-3, 4)
 """Powers of ten whose numbers are written out at an axis; others have a common factor."""
 RESTING_MM = 0.05
@@ -83,24 +86,33 @@ def path_chart(log: EpisodeLog, title: str = "path over target") -> Picture:
 def error_chart(log: EpisodeLog) -> Picture | None:
     """The distance from the reference over time; with a beam, only while it is on.
 
-    On an organ that moves it is the distance on the tissue.
+    On an organ that moves it is the distance on the tissue. Steps at which the task measures no
+    error, such as those before the reference moves, are grey: no number counts them.
     """
     tissue = log.measures.get("tissue_error_mm")
     named = log.measures.get("beam_error_mm") if tissue is None else tissue
-    error = _drawable(log.error_mm if named is None else named)
-    if np.isnan(error).all():
+    every = _drawable(log.error_mm if named is None else named)
+    if np.isnan(every).all():
         return None
-    largest = float(np.nanmax(error))
+    measured = log.measures.get("error_mm")
+    counts = np.isfinite(every if named is not None or measured is None else measured)
+    error = np.where(counts, every, np.nan)
+    highest = float(np.nanmax(every))
     with drawing():
         figure, axis = plt.subplots()
         axis.plot(log.time_s, error, c=RED, lw=1.0)
-        axis.set_ylim(0.0, 1.08 * largest if largest > 0.0 else 1.0)
+        caption = f"Largest {np.nanmax(error):.3g} mm" if counts.any() else "No error is measured"
+        if (left := ~counts & np.isfinite(every)).any():
+            first = left | np.append(left[1:], False) | np.append(False, left[:-1])
+            axis.plot(log.time_s, np.where(first, every, np.nan), c=MUTED, lw=1.0, zorder=1)
+            caption += "; grey: the numbers do not count these steps"
+        axis.set_ylim(0.0, 1.08 * highest if highest > 0.0 else 1.0)
         axis.set_xlim(0.0, log.time_s[-1])
         axis.set_xlabel("time [s]")
         axis.set_ylabel("error [mm]")
         title = "error over time" if tissue is None else "error on the tissue"
         axis.set_title(title + (" while the beam is on" if log.beams else ""))
-        return chart(figure, "error over time", f"Largest {largest:.3g} mm")
+        return chart(figure, "error over time", caption)
 
 
 def _drawable(lengths_mm: np.ndarray) -> np.ndarray:
@@ -270,8 +282,13 @@ def spread_chart(
         every = np.concatenate([values for _, values in known])
         if "[" not in label and every.min() >= 0.0 and every.max() <= 1.0:  # a share
             axis.set_xlim(-0.02, 1.02)
-        axis.locator_params(axis="x", nbins=MOST_TICKS)
-        axis.ticklabel_format(axis="x", scilimits=PLAIN_POWERS, useOffset=False, useMathText=True)
+        if "[mm]" in label and 0.0 < every.min() <= every.max() / DECADES:
+            axis.set_xscale("log")
+        else:
+            axis.locator_params(axis="x", nbins=MOST_TICKS)
+            axis.ticklabel_format(
+                axis="x", scilimits=PLAIN_POWERS, useOffset=False, useMathText=True
+            )
         axis.set_xlabel(label)
         if title != label:
             axis.set_title(title)

@@ -8,16 +8,19 @@ Closed loop: the same robot, with the same history, is driven a second time by t
 its own samples. Rounding now comes back through the robot. Arm models with a direction of pressure
 change jump where it reverses, and sensors read in steps, so that a policy may rest beside a
 reversal at an unstable equilibrium: what differs grows there from decision to decision, until two
-courses of the same policy are as far apart as two courses can be. Therefore, where the loops
-differ, the policy is also compared with itself after its first command was `NUDGE_KPA` higher;
-where that does not show it, with every command moved at random by as much as the controller's
-differ given the same measurements. What the policy then differs from itself by, no controller can
-stay below that computes with rounded numbers.
+courses of the same policy are as far apart as two courses can be. How far the loops are apart then
+says nothing about the controller.
+
+Own course: therefore, where the loops differ, the policy is given the samples of the controller's
+own loop, and both are compared at every decision of it, as given the same measurements. Where they
+agree, the controller's loop is that of the policy with every command rounded by no more than this:
+the robot makes the rest of the difference.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -31,8 +34,8 @@ from surgisoft.agents.on_rig import BuildRig, RigConfig, named_rig, on_rig
 from surgisoft.agents.policies import Policy
 from surgisoft.agents.rollout import Instant, rollout
 from surgisoft.errors import InputError
-from surgisoft.rig import SimulatedRig
-from surgisoft.rig.interface import Sample, Truth, is_simulated
+from surgisoft.rig import Rig, SimulatedRig
+from surgisoft.rig.interface import Sample, Truth, checked_command, is_simulated
 from surgisoft.tasks.base import Signal, Task, TaskState
 
 TOLERANCE_MM = 1e-4
@@ -41,11 +44,6 @@ TOLERANCE_KPA = 5e-4
 """Largest accepted difference of a command, kPa. Key points of 100 mm in single precision are
 8e-6 mm apart; the direction of a tip, and the policy, make 2e-4 kPa of that. A reading of the
 virtual rig's pressure sensors has steps of 0.02 kPa."""
-NUDGE_KPA = 1e-6
-"""By how much the first command is moved to see what the loop makes of rounding, kPa. Neighbouring
-numbers of single precision are 2e-6 kPa apart at 20 kPa, 4e-6 kPa from 32 kPa."""
-EXPLAINS = 10.0
-"""A difference up to this many times that of the policy from itself is rounding, no unit."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +60,6 @@ class Differences:
         """Whether both are within `TOLERANCE_MM` and `TOLERANCE_KPA`."""
         return self.points_mm <= TOLERANCE_MM and self.commands_kPa <= TOLERANCE_KPA
 
-    def explains(self, other: Differences) -> bool:
-        """Whether a policy that differs from itself by this much explains another difference."""
-        most_mm = max(TOLERANCE_MM, EXPLAINS * self.points_mm)
-        most_kPa = max(TOLERANCE_KPA, EXPLAINS * self.commands_kPa)
-        return other.points_mm <= most_mm and other.commands_kPa <= most_kPa
-
 
 @dataclass(frozen=True)
 class RigCheck:
@@ -79,17 +71,14 @@ class RigCheck:
     """Each in its own closed loop on the same robot: commands, and true key points."""
     decisions: int
     """Decisions of the episode, without the first."""
-    nudged: Differences | None = None
-    """The policy and itself, of which commands were moved: as `closed`; None where `closed` is
-    accepted."""
-    moved_kPa: float | None = None
-    """Up to how much every command was moved at random for `nudged`, kPa; None: the first one was
-    moved by `NUDGE_KPA`."""
+    own: Differences | None = None
+    """Given the measurements of the controller's own loop: as `same`; None where `closed` is
+    accepted, or `same` is not."""
 
     @property
     def amplified(self) -> bool:
-        """Whether the closed loops differ by rounding that the loop amplifies, as `nudged` does."""
-        return self.nudged is not None and self.nudged.explains(self.closed)
+        """Whether the closed loops differ by rounding alone, which the loop amplifies."""
+        return self.own is not None and self.own.accepted
 
     @property
     def passed(self) -> bool:
@@ -100,14 +89,7 @@ class RigCheck:
 class _LoggedRig:
     """A simulated rig that keeps commands and samples; it has the methods of the rig."""
 
-    def __init__(
-        self,
-        build: BuildRig,
-        nudges: Mapping[int, float],
-        config: RigConfig,
-        trial: int,
-    ):
-        """nudges: number of a command -> by how much the rig is commanded more, kPa."""
+    def __init__(self, build: BuildRig, config: RigConfig, trial: int):
         rig = build(config, trial)
         if not is_simulated(rig):
             raise InputError(
@@ -115,22 +97,39 @@ class _LoggedRig:
                 "expected a simulated rig"
             )
         self.rig: SimulatedRig = rig
-        self.made, self.nudges = (config, trial), nudges
+        self.made = config, trial
         self.commands: list[np.ndarray] = []
-        self.samples: list[tuple[np.ndarray, np.ndarray]] = []
+        self.samples: list[tuple[Sample, Truth]] = []
 
     def __getattr__(self, name: str):
         return getattr(self.rig, name)
 
     def command(self, pressures: np.ndarray) -> None:
-        more_kPa = self.nudges.get(len(self.commands), 0.0)
         self.commands.append(np.array(pressures))
-        self.rig.command(np.clip(pressures + more_kPa, *self.rig.limits.T))
+        self.rig.command(pressures)
 
     def read_beside_truth(self) -> tuple[Sample, Truth]:
         sample, truth = self.rig.read_beside_truth()
-        self.samples.append((np.array(sample.measured), np.array(sample.key_points_mm)))
+        self.samples.append(deepcopy((sample, truth)))
         return sample, truth
+
+
+class _PlayedRig:
+    """A simulated rig that gives the samples of another drive, whatever it is commanded."""
+
+    def __init__(self, rig: Rig, samples: Sequence[tuple[Sample, Truth]]):
+        self.rig, self.samples, self.read = rig, samples, 0
+
+    def __getattr__(self, name: str):
+        return getattr(self.rig, name)
+
+    def command(self, pressures: np.ndarray) -> None:
+        checked_command(pressures, self.rig.limits, self.rig.unit)
+
+    def read_beside_truth(self) -> tuple[Sample, Truth]:
+        """The next sample; after the end of the other drive the last one stays."""
+        self.read += 1
+        return self.samples[min(self.read, len(self.samples)) - 1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,10 +176,9 @@ class DrivenEpisode:
 
     def measured(self, row: int) -> tuple[dict, dict]:
         """Pressures and key points of a sample, by arm."""
-        pressures, points = (
-            {name: rig.samples[row][each] for name, rig in self.rigs.items()} for each in range(2)
-        )
-        return pressures, points
+        samples = {name: rig.samples[row][0] for name, rig in self.rigs.items()}
+        pressures = {name: sample.measured for name, sample in samples.items()}
+        return pressures, {name: sample.key_points_mm for name, sample in samples.items()}
 
 
 def drive(
@@ -189,14 +187,9 @@ def drive(
     config: RigConfig | None = None,
     seed: int = 0,
     build: BuildRig = named_rig,
-    nudges: Mapping[int, float] | None = None,
 ) -> DrivenEpisode:
-    """Episode 0 of a seed on virtual rigs, driven by a policy as `evaluate --on rig` does.
-
-    nudges: number of a command since the rigs were made -> by how much every rig is then commanded
-    more than the policy asks for, kPa.
-    """
-    moved = on_rig(task, config or RigConfig(), partial(_LoggedRig, build, nudges or {}))
+    """Episode 0 of a seed on virtual rigs, driven by a policy as `evaluate --on rig` does."""
+    moved = on_rig(task, config or RigConfig(), partial(_LoggedRig, build))
     states: list[TaskState] = []
 
     def keep(instant: Instant) -> None:
@@ -236,12 +229,13 @@ def same_measurements(
 
 def closed_loop(
     controller: Controller, episode: DrivenEpisode, build: BuildRig = named_rig
-) -> Differences:
+) -> tuple[Differences, dict[str, _LoggedRig]]:
     """Differences of a controller that drives the robot of an episode from its own samples.
 
-    What a task observes of its scene is given to the controller as it was in the episode.
+    What a task observes of its scene is given to the controller as it was in the episode. Also
+    returns the rigs by arm, with what they were commanded and measured.
     """
-    rigs = {name: cast(SimulatedRig, build(*rig.made)) for name, rig in episode.rigs.items()}
+    rigs = {name: _LoggedRig(build, *rig.made) for name, rig in episode.rigs.items()}
     for rig in rigs.values():
         rig.reset()
     first = _prepared(controller, episode)
@@ -262,20 +256,18 @@ def closed_loop(
             pose = part.mount[0].double().numpy()
             true = measured[2][name] @ pose[:3, :3].T + pose[:3, 3]
             points.append(float(np.abs(true - part.points_mm[0].numpy()).max()))
-    return Differences(float(np.max(points)), float(np.max(commands)))
+    return Differences(float(np.max(points)), float(np.max(commands))), rigs
 
 
-def apart(one: DrivenEpisode, other: DrivenEpisode) -> Differences:
-    """Differences of two driven episodes, as far as the shorter one goes."""
-    points, commands = [0.0], [0.0]
-    for before, after in zip(one.states, other.states, strict=False):
-        for name, part in before.world.arms.items():
-            off = part.points_mm - after.world.arms[name].points_mm
-            points.append(float(off.abs().max()))
-    for name, rig in one.rigs.items():
-        for asked, also in zip(rig.commands, other.rigs[name].commands, strict=False):
-            commands.append(float(np.abs(asked - also).max()))
-    return Differences(float(np.max(points)), float(np.max(commands)))
+def replaying(rigs: Mapping[str, _LoggedRig], build: BuildRig = named_rig) -> BuildRig:
+    """What makes rigs that give the samples of a closed loop again (`closed_loop`, `drive`)."""
+    samples = {rig.made[1]: rig.samples for rig in rigs.values()}
+
+    def played(config: RigConfig, trial: int) -> Rig:
+        rig = build(config, trial)
+        return cast(Rig, _PlayedRig(rig, samples[trial])) if trial in samples else rig
+
+    return played
 
 
 def check_on_rig(
@@ -292,19 +284,12 @@ def check_on_rig(
     """
     episode = drive(task, policy, config, seed, build)
     same = same_measurements(controller, episode)
-    closed = closed_loop(controller, episode, build)
-    if closed.accepted:
+    closed, rigs = closed_loop(controller, episode, build)
+    if closed.accepted or not same.accepted:
         return RigCheck(same, closed, episode.decisions)
-    nudges = {episode.settled: NUDGE_KPA}
-    nudged = apart(episode, drive(task, policy, config, seed, build, nudges))
-    if nudged.explains(closed) or not same.accepted:
-        return RigCheck(same, closed, episode.decisions, nudged)
-    most_kPa = max(NUDGE_KPA, same.commands_kPa)
-    rows = range(episode.settled, episode.settled + episode.samples * task.steps)
-    moved = np.random.default_rng(0).uniform(-most_kPa, most_kPa, len(rows)).tolist()
-    nudges = dict(zip(rows, moved, strict=True))
-    nudged = apart(episode, drive(task, policy, config, seed, build, nudges))
-    return RigCheck(same, closed, episode.decisions, nudged, most_kPa)
+    beside = drive(task, policy, config, seed, replaying(rigs, build))
+    own = same_measurements(controller, beside, episode.decisions)
+    return RigCheck(same, closed, episode.decisions, own)
 
 
 def _prepared(controller: Controller, episode: DrivenEpisode) -> dict[str, float]:
@@ -356,7 +341,7 @@ def _by_arm(command, arms: dict) -> dict[str, np.ndarray]:
 
 
 def _measured(
-    rigs: dict[str, SimulatedRig], asked: dict[str, np.ndarray]
+    rigs: Mapping[str, _LoggedRig], asked: dict[str, np.ndarray]
 ) -> tuple[dict, dict, dict]:
     """Pressures, key points and true key points of the next sample, by arm."""
     rows: tuple[dict, dict, dict] = ({}, {}, {})

@@ -222,6 +222,38 @@ class RunFolder:
             seed=c.seed,
         )
 
+    def longer_plan(self, steps: int) -> Plan:
+        """The plan with more steps, where training on equals a training of so many from the start.
+
+        Raises InputError where it does not: where the noise of the actions has a schedule over the
+        whole training, or time decides about its end; and for no more steps than before.
+        """
+        plan = self.plan()
+        if plan.steps is None or plan.minutes is not None:
+            raise InputError(
+                f"{self.path}: its training ends by --minutes; --steps raises the steps of a run "
+                "that was started with --steps alone"
+            )
+        if steps <= plan.steps:
+            raise InputError(
+                f"--steps is {steps:,}, and {self.path} was started with {plan.steps:,}; expected "
+                "more: all steps count, those before too"
+            )
+        if plan.preset.last_noise is not None:
+            raise InputError(
+                f"{self.path}: cannot go on to {steps:,} steps, because the noise of its actions "
+                f"(preset {plan.preset_name}) fell to its least over its {plan.steps:,} steps; "
+                f"train a new run: surgisoft train --task {plan.task} --preset {plan.preset_name} "
+                f"--seed {plan.seed} --steps {steps} -o NEW (runs of --preset paper can go on)"
+            )
+        return replace(plan, steps=steps)
+
+    def set_steps(self, steps: int) -> None:
+        """Write another number of steps into the plan of the run (`longer_plan`)."""
+        self.config["steps"] = steps
+        write_atomically(self._file, json.dumps(self.config, indent=2) + "\n", noted=False)
+        self.checked = replace(self.checked, steps=steps)
+
     def _task_config(self):
         self._check_task()
         config = config_from(self.config["task"], self.config["task_config"], self._file)

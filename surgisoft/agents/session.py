@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -14,6 +14,7 @@ import torch
 from surgisoft.agents.evaluate import (
     CONFIDENCE,
     Evaluation,
+    differences,
     exact_checks_of,
     summarised,
     watched_by,
@@ -21,11 +22,12 @@ from surgisoft.agents.evaluate import (
 from surgisoft.agents.exact_checks import ExactChecks
 from surgisoft.agents.learned import check_fits
 from surgisoft.agents.policies import POLICIES, Policy, check_policy, open_policy
+from surgisoft.agents.policy_names import short_names, without_repeats
 from surgisoft.agents.rollout import BATCH, EpisodeRecorders, rollout
 from surgisoft.agents.run_folder import RunFolder
 from surgisoft.config import to_table
 from surgisoft.errors import InputError, Interrupted, counted, wrong_type
-from surgisoft.files import with_former_keys
+from surgisoft.files import json_safe, with_former_keys
 from surgisoft.progress import Progress, silent
 from surgisoft.scene.folder import Scene, open_scene
 from surgisoft.tasks.base import Episodes, Task
@@ -305,7 +307,8 @@ class Evaluations:
         if not self.interrupted:
             return ""
         done = {result.policy: result.episodes for result in self.results}
-        parts = [f"{Path(name).name} {done.get(name, 0):,}" for name in self.request.policies]
+        words = short_names(self.request.policies)
+        parts = [f"{word} {done.get(name, 0):,}" for name, word in words.items()]
         of = counted(self.request.episodes, "episode")
         return f"interrupted; finished of {of} each: {', '.join(parts)}"
 
@@ -327,6 +330,13 @@ class Evaluations:
             "policies": {
                 name: result.to_json()
                 for name, result in zip(asked.policies, self.results, strict=not self.interrupted)
+            },
+            "differences": {
+                result.policy: {
+                    name: json_safe(asdict(value))
+                    for name, value in differences(self.results[0], result).items()
+                }
+                for result in self.results[1:]
             },
         }
         return with_former_keys(values, {"drivers": "policies"})
@@ -358,8 +368,10 @@ def evaluate(
     given = [policies] if isinstance(policies, str | Path) else policies
     if not isinstance(given, Iterable):
         raise wrong_type("policies", given, "the name of a policy, or several names")
-    names = tuple(dict.fromkeys(str(name) for name in given))
-    request = EvaluationRequest(names, task, **fields).under_rules()
+    names, repeated = without_repeats([str(name) for name in given])
+    for name in dict.fromkeys(repeated):
+        on_warning(f"policy {name} is given more than once; it is evaluated once")
+    request = EvaluationRequest(tuple(names), task, **fields).under_rules()
     for line in () if request.rules is None else request.rules.left_out:
         on_warning(line)
     plain, config = request.resolved(on_warning)

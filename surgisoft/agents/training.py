@@ -358,11 +358,14 @@ def resume(
     device: torch.device,
     report: Callable[[TrainingProgress], None] = lambda progress: None,
     logger: str = TENSORBOARD,
+    steps: int | None = None,
 ) -> Result:
     """Continue a run from its last checkpoint.
 
     A run that ended before its first checkpoint begins again, with a warning. Raises InputError
     where a checkpoint was lost, and leaves the run as it is.
+
+    steps: all steps of the run from now on, see `RunFolder.longer_plan`; None: those of its plan.
     """
     run = RunFolder(folder)
     if not run.checkpoint(LAST).is_file():
@@ -373,7 +376,7 @@ def resume(
                 AssumptionWarning,
                 stacklevel=2,
             )
-    return _continue(run, processes, device, report, logger)
+    return _continue(run, processes, device, report, logger, steps)
 
 
 def _check_begun(run: RunFolder) -> None:
@@ -395,11 +398,17 @@ def _check_begun(run: RunFolder) -> None:
             )
 
 
-def reopened(folder: Path, processes: Processes, device: torch.device) -> Training:
-    """The training of a run at its last checkpoint, ready to go on; new where it has none."""
+def reopened(
+    folder: Path, processes: Processes, device: torch.device, steps: int | None = None
+) -> Training:
+    """The training of a run at its last checkpoint, ready to go on; new where it has none.
+
+    steps: as for `resume`.
+    """
     run = RunFolder(folder)
+    longer = None if steps is None else run.longer_plan(steps)
     saved = run.load(LAST) if run.checkpoint(LAST).is_file() else None
-    plan = run.plan()
+    plan = longer or run.plan()
     if saved is not None:
         with damaged(run.checkpoint(LAST)):
             _check_saved(run, saved, plan)
@@ -423,8 +432,11 @@ def _check_saved(run: RunFolder, saved: dict[str, Any], plan: Plan) -> None:
             )
 
 
-def _continue(run, processes, device, report, logger: str) -> Result:
-    training = reopened(run.path, processes, device)
+def _continue(run, processes, device, report, logger: str, steps: int | None = None) -> Result:
+    training = reopened(run.path, processes, device, steps)
+    processes.wait()  # until each of them has read the plan
+    if steps is not None and processes.leads:
+        run.set_steps(steps)
     plan, first = training.plan, training.iteration
     ahead = training.share < 1.0
     log = _Log(run, training.iteration, logger) if processes.leads and ahead else None

@@ -19,6 +19,7 @@ from surgisoft.agents.session import task_config
 from surgisoft.agents.training import Result, TrainingProgress, resume, train_new
 from surgisoft.config import COMMAND_LINE, Where, from_table, merged, to_table
 from surgisoft.errors import InputError
+from surgisoft.tasks.arguments import whole
 from surgisoft.tasks.path_following import beyond_reach
 from surgisoft.tasks.registry import changed_config, task_names
 from surgisoft.workers import torch_threads
@@ -129,13 +130,16 @@ def train(
     step for options that do not fit each other.
 
     output: folder of the new run; default `runs/TASK-DATE-TIME`.
-    resume_from: folder of an interrupted run that goes on, in place of a task and its fields.
+    resume_from: folder of an interrupted run that goes on, in place of a task and its fields; with
+    `steps`, more than it was started with, also a finished one whose noise has no schedule.
     fields: other fields of `TrainingRequest`, such as `steps=100_000` or `arm="my_arm"`.
     progress: called with the state of the training after each iteration. on_plan: called with the
     plan of a new run before training. logger: where curves go beside the folder, one of `LOGGERS`.
     """
-    report = progress or (lambda state: None)
+    report, steps = progress or (lambda state: None), None
     if resume_from is not None:
+        steps = fields.pop("steps", None)
+        steps = None if steps is None else whole("steps", steps, 1)
         names = [*(["task"] if task else []), *(["output"] if output else []), *fields]
         if names:
             given = ", ".join(ASSIGNED.get(n, f"--{n.replace('_', '-')}") for n in names)
@@ -153,7 +157,7 @@ def train(
         if plan is not None and plan.preset.compile:
             check_compiler(kind)
         if plan is None:
-            result = resume(folder, here, kind, report, logger)
+            result = resume(folder, here, kind, report, logger, steps)
         else:
             result = train_new(folder, plan, here, kind, report, logger)
         return TrainedRun(folder, result, here.leads)
@@ -195,7 +199,9 @@ def shortfall(run: TrainedRun) -> str:
     if not why:
         return ""
     usual = steps_for("fast", RunFolder(run.folder).config["task"])
-    more = f"train longer ({usual:,} steps are usual) or " if run.result.steps < usual else ""
+    more = ""
+    if run.result.steps < usual:
+        more = f"train a new run with more --steps ({usual:,} are usual) or "
     return f"the training did not converge: {why}; {more}try another --seed"
 
 

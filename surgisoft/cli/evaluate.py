@@ -1,11 +1,13 @@
 """`surgisoft evaluate`: evaluate policies on a task, in simulation or on rigs."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from surgisoft.agents.policy_names import short_names, without_repeats
 from surgisoft.cli import INTERRUPTED, app
 from surgisoft.cli.files import check_folder, check_free, check_replay, show_written
 from surgisoft.cli.inputs import warn
@@ -111,7 +113,7 @@ def evaluate(
     --replay FILE.rrd writes the first episode; of several policies one FILE-POLICY.rrd each.
     """
     check_free(json_file, "policies", "drivers")
-    replays = _replays(policies, replay)
+    replays = replay_files(policies, replay)
     for path in replays.values():
         check_replay(path)
     check_folder(report)
@@ -189,17 +191,18 @@ def evaluate(
         raise typer.Exit(INTERRUPTED)
 
 
-def _replays(policies: list[str], replay: Path | None) -> dict[str, Path]:
+def replay_files(policies: list[str], replay: Path | None) -> dict[str, Path]:
     """Policy -> the file of its replay: the given one, or NAME-POLICY.rrd of several policies."""
-    names = list(dict.fromkeys(policies))
     if replay is None:
         return {}
+    names, _ = without_repeats(policies)
     if len(names) == 1:
         return {names[0]: replay}
     found: dict[str, Path] = {}
-    for name in names:
-        path = replay.with_name(f"{replay.stem}-{Path(name).name or 'run'}{replay.suffix}")
-        if path in found.values():  # runs of one name in two folders
+    for name, short in short_names(names).items():
+        word = "-".join(part for part in Path(short).parts if part != os.sep) or "run"
+        path = replay.with_name(f"{replay.stem}-{word}{replay.suffix}")
+        if path in found.values():  # such as a-run beside a/run
             path = path.with_stem(f"{path.stem}-{len(found) + 1}")
         found[name] = path
     return found
@@ -243,10 +246,12 @@ def _rig_config(
 
 
 def _show(results) -> None:
-    from surgisoft.agents.evaluate import cell
+    from surgisoft.agents.evaluate import cell, differences
+    from surgisoft.tasks.supervision import MEAN_MM, main_error
 
     names = list(dict.fromkeys(name for result in results for name in result.overall))
-    rows = [["", *(Path(result.policy).name for result in results)]]
+    words = short_names([result.policy for result in results])
+    rows = [["", *words.values()]]
     for name in names:
         cells = (cell(name, result.overall.get(name)) for result in results)
         rows.append([name, *cells])
@@ -254,11 +259,19 @@ def _show(results) -> None:
     for first, *values in rows:
         held = "".join(f"   {cell:>{w}s}" for cell, w in zip(values, widths[1:], strict=True))
         print(f"{first:{widths[0]}s}{held}")
+    for result in results[1:]:
+        apart = differences(results[0], result)
+        name = (main_error(apart) or ("",))[0] + MEAN_MM
+        if name in apart and apart[name].episodes:
+            print(
+                f"{words[result.policy]} minus {words[results[0].policy]}, episode by episode: "
+                f"{name} {cell(name, apart[name])}"
+            )
     for result in results:
         if result.checks is not None:
             facts = result.to_json()["exact_checks"]
             print(
-                f"exact collision checker on {Path(result.policy).name}: of "
+                f"exact collision checker on {words[result.policy]}: of "
                 f"{counted(facts['instants'], 'instant')} the batched geometry differs on contact "
                 f"in {facts['contact_differs']} and on what the beam hits in "
                 f"{facts['beam_differs']}; the hit differs by at most {facts['beam_off_mm']:.1g} "

@@ -111,26 +111,40 @@ def _run(
 
     policy = LearnedPolicy(source, which=which)
     task = policy.run.task()
-    with progress(f"export {source}"):
-        files = export_policy(policy, output, task, force=force)
+
+    lines: list[str] = []
+    try:
+        with progress(f"export {source}") as report:
+
+            def checked(controller: Controller) -> None:
+                report.step(1, 2, "one episode on the virtual rig")
+                found = check_on_rig(controller, task, policy)
+                lines.extend(_compared(found))
+                if not found.passed:
+                    lines.append(
+                        f"no file was written to {output}; without --check the files are written "
+                        "unchecked"
+                    )
+                    raise typer.Exit(DIFFERS)
+
+            files = export_policy(
+                policy, output, task, force=force, check=checked if check else None
+            )
+    finally:
+        for line in lines:
+            print(line)
     if not (output / "controller.py").is_file():
         note = read_json(output / "policy.json")["note"]
         print(f"controller: not exported, only the policies: {note}")
         return files, not check
-    if check:
-        with progress("one episode on the virtual rig"):
-            found = check_on_rig(Controller(output), task, policy)
-        for line in _compared(found):
-            print(line)
-        return files, found.passed
     return files, True
 
 
 def _compared(found: "RigCheck") -> list[str]:
     """What is printed of a comparison on the virtual rig."""
-    from surgisoft.agents.rig_check import NUDGE_KPA, TOLERANCE_KPA, TOLERANCE_MM
+    from surgisoft.agents.rig_check import TOLERANCE_KPA, TOLERANCE_MM
 
-    same, closed, nudged = found.same, found.closed, found.nudged
+    same, closed, own = found.same, found.closed, found.own
     lines = [
         f"on the virtual rig, {found.decisions} decisions: largest differences of exported "
         "controller and policy",
@@ -139,19 +153,26 @@ def _compared(found: "RigCheck") -> list[str]:
         f"closed loop: commands {closed.commands_kPa:.2g} kPa, true key points "
         f"{closed.points_mm:.2g} mm",
     ]
-    if not same.accepted:
-        lines.append("the exported controller does not compute what the policy computes")
-    elif nudged is not None:
-        how = f"its first command moved by {NUDGE_KPA:g} kPa"
-        if found.moved_kPa is not None:
-            how = f"every command moved at random by up to {found.moved_kPa:.2g} kPa"
+    if own is not None:
         lines.append(
-            f"the policy beside itself, {how}: commands {nudged.commands_kPa:.2g} kPa, true key "
-            f"points {nudged.points_mm:.2g} mm"
+            "same measurements, those of the controller's closed loop: commands "
+            f"{own.commands_kPa:.2g} kPa, estimated key points {own.points_mm:.2g} mm"
         )
+    if not same.accepted:
         lines.append(
-            "the loop amplifies rounding: the policy differs as much from itself"
-            if found.amplified
-            else "the exported controller does in the loop what the policy does not do"
+            "failed: given the measurements of the policy's episode, the exported controller does "
+            "not compute what the policy computes"
+        )
+    elif found.amplified:
+        lines.append(
+            "passed: at every decision of both loops the exported controller computes what the "
+            "policy computes; the loops differ because the robot amplifies rounding"
+        )
+    elif found.passed:
+        lines.append("passed: the exported controller does in the loop what the policy does")
+    else:
+        lines.append(
+            "failed: given the measurements of its own closed loop, the exported controller does "
+            "not compute what the policy computes"
         )
     return lines

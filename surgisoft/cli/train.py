@@ -169,7 +169,12 @@ def train(
         ),
     ] = None,
     resume: Annotated[
-        Path | None, typer.Option(metavar="RUN", help="Continue an interrupted run.")
+        Path | None,
+        typer.Option(
+            metavar="RUN",
+            help="Continue an interrupted run; with --steps also a finished one of --preset paper, "
+            "to that many steps in all.",
+        ),
     ] = None,
     arm: Arm = None,
     scene: SceneFolder = None,

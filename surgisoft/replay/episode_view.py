@@ -28,7 +28,14 @@ from surgisoft.replay.contents import TIME
 from surgisoft.replay.endoscope import PICTURES_HZ, camera_entity, log_camera
 from surgisoft.replay.legends import dose_picture
 from surgisoft.replay.plots import Plot, plots_of, time_axis
-from surgisoft.replay.recording import LEGEND, LEVELS, STEP, Columns, new_recording
+from surgisoft.replay.recording import (
+    LEGEND,
+    LEVELS,
+    STEP,
+    Columns,
+    event_lines,
+    new_recording,
+)
 from surgisoft.replay.shapes import creased, widest_apart
 from surgisoft.replay.surfaces import DosedSurface, dosed_surface
 from surgisoft.scene import frames
@@ -37,6 +44,14 @@ from surgisoft.scene.rays import EmbreeSurface
 from surgisoft.scene.render import LESION_TINT
 from surgisoft.tasks.episodes.log import JUMP_MM, DoseLog, EpisodeLog
 
+PICTURE_HEIGHT = 1.5
+"""Height of the row with the endoscope's picture, in those of a row of plots."""
+FITTING_LINES = 5
+"""Lines of a legend that a row of plots shows; more were cut off."""
+LINE_HEIGHT = 0.25
+"""Height that each further line takes, in rows of plots; where other rows are taller too."""
+EVENT_COLUMNS = (52, 34)
+"""Characters of a line of the events, which the viewer cuts at the edge; beside a dose scale."""
 SCENE = "Scene"
 """Name of the 3D view."""
 TRAIL = "/path/real"
@@ -52,7 +67,10 @@ def episode_blueprint(log: EpisodeLog, plots: tuple[Plot, ...]) -> rrb.Blueprint
     cells = [*_pictures(log), *_cells(plots, float(log.time_s[-1]))]
     pairs = [cells[i : i + 2] for i in range(0, len(cells), 2)]
     rows = [pair[0] if len(pair) == 1 else rrb.Horizontal(*pair) for pair in pairs]
-    shares = [1.5 if log.cameras and i == 0 else 1.0 for i in range(len(rows))]
+    named = {plot.title: len(plot.lines) for plot in plots if plot.legend}
+    shares = [_height(row, named) for row in rows]
+    if log.cameras:
+        shares[0] = max(PICTURE_HEIGHT, shares[0])
     legend = rrb.TextDocumentView(origin=LEGEND, name="Colours")
     below = rrb.Horizontal(_events(), legend, column_shares=[3, 2])
     if log.dose is not None:
@@ -66,6 +84,15 @@ def episode_blueprint(log: EpisodeLog, plots: tuple[Plot, ...]) -> rrb.Blueprint
         rrb.SelectionPanel(state="hidden"),
         rrb.TimePanel(state="collapsed", timeline=TIME, play_state="playing", loop_mode="all"),
     )
+
+
+def _height(row: rrb.Container | rrb.View, named: dict[str, int]) -> float:
+    """Height of a row of views, in those of a row of plots: room for the longest legend in it.
+
+    named: title of a plot -> lines in its legend.
+    """
+    most = max((named.get(name, 0) for name in _view_names(row)), default=0)
+    return 1.0 + LINE_HEIGHT * max(0, most - FITTING_LINES)
 
 
 def _pictures(log: EpisodeLog) -> list:
@@ -483,6 +510,6 @@ def _log_events(recording, log: EpisodeLog) -> None:
     for event in log.events:
         recording.set_time("time", duration=event.time_s)
         recording.set_time("step", sequence=round(event.time_s / log.dt_s))
-        text = f"{event.time_s:6.1f} s  {event.text}"
-        recording.log("/events", rr.TextLog(text, level=LEVELS[event.level]))
+        for line in event_lines(event.time_s, event.text, EVENT_COLUMNS[log.dose is not None]):
+            recording.log("/events", rr.TextLog(line, level=LEVELS[event.level]))
     recording.reset_time()

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import textwrap
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +32,7 @@ from surgisoft.replay.colours import (
     series_colour,
 )
 from surgisoft.replay.plots import Corner, Kept, last_seconds, time_axis
-from surgisoft.replay.recording import LEGEND, SUFFIX, TIME
+from surgisoft.replay.recording import LEGEND, SUFFIX, TIME, event_lines
 from surgisoft.replay.shapes import finer
 from surgisoft.replay.viewer import (
     LOCAL,
@@ -201,9 +200,8 @@ class LiveView:
         """Show what happened at a time (s)."""
         self.recording.set_time(TIME, duration=t_s)
         level = "ERROR" if serious else "INFO"
-        for number, line in enumerate(textwrap.wrap(text, EVENT_COLUMNS)):
-            begin = f"{'':10}" if number else f"{t_s:6.1f} s  "
-            self.recording.log(EVENTS, rr.TextLog(begin + line, level=level))
+        for line in event_lines(t_s, text, EVENT_COLUMNS):
+            self.recording.log(EVENTS, rr.TextLog(line, level=level))
 
     def _lines(
         self,

@@ -113,7 +113,7 @@ def plots_of(log: EpisodeLog) -> tuple[Plot, ...]:
         title = "Clearance (mm), red: limit" if log.limits else "Clearance (mm)"
         made.append(Plot(title, _clearance(log)))
     for agent, terms in log.rewards.items():
-        title = f"Reward of {agent}"
+        title = f"Reward: {agent}"
         made.append(Plot(title, _lines(f"reward/{agent}", terms), "rightbottom", "rewards"))
     if others:
         made.append(Plot("Other measures", _lines("measures", others), "righttop"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -27,6 +28,12 @@ LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 """An event's level in Rerun's text log."""
 _IMPORTED_IN = os.getpid()
 """The process that imported this module: a fork of it cannot flush recordings of its parent."""
+
+
+def event_lines(t_s: float, text: str, columns: int) -> list[str]:
+    """The lines of an event at a time (s): the viewer shows one line of a text, cut at the edge."""
+    wrapped = textwrap.wrap(text, columns)
+    return [f"{'':10}{line}" if n else f"{t_s:6.1f} s  {line}" for n, line in enumerate(wrapped)]
 
 
 @contextlib.contextmanager

@@ -1,6 +1,7 @@
 """Find a replay and show it: in a window, in a browser, as a picture, or as a file."""
 
 import contextlib
+import difflib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -23,6 +24,8 @@ from surgisoft.tasks.episodes.file import load_episode
 
 PLACES = (f"*{SUFFIX}", f"replays/*{SUFFIX}", "replays/*.npz")
 """Patterns of replays in a run's folder."""
+MOST_NEAR = 5
+"""Most replays that a message suggests for a missing one."""
 MAGIC = b"RRF2"
 """First bytes of a Rerun recording, as rerun-sdk 0.41 writes it."""
 
@@ -39,7 +42,11 @@ def find_replay(path: str | Path) -> Path:
             )
         return max(replays, key=lambda file: (file.stat().st_mtime_ns, file.name))
     if not path.is_file():
-        raise InputError(f"{path}: there is no such file or folder; expected a replay or a run")
+        near = _near(path)
+        hint = f"; did you mean {near}?" if near else ""
+        raise InputError(
+            f"{path}: there is no such file or folder; expected a replay or a run{hint}"
+        )
     if path.suffix not in (SUFFIX, ".npz"):
         raise InputError(
             f"{path}: suffix '{path.suffix}', expected a replay ({SUFFIX}), an episode's log "
@@ -53,6 +60,20 @@ def find_replay(path: str | Path) -> Path:
                 f"{path}: is not a Rerun recording; expected one as 'replay' writes it"
             )
     return path
+
+
+def _near(path: Path) -> str:
+    """Replays that a missing one may mean, in words; empty where there are none.
+
+    Those that `evaluate --replay` writes beside it for several policies (NAME-POLICY.rrd), else
+    those of a similar name.
+    """
+    beside = path.parent.glob("*") if path.parent.is_dir() else ()
+    replays = {file.name for file in beside if file.suffix in (SUFFIX, ".npz")}
+    near = sorted(name for name in replays if name.startswith(f"{path.stem}-"))
+    near = near or difflib.get_close_matches(path.name[:100], sorted(replays), MOST_NEAR)
+    shown = [str(path.with_name(name)) for name in near[:MOST_NEAR]]
+    return " or ".join([", ".join(shown[:-1]), shown[-1]] if shown[1:] else shown)
 
 
 def moment(recording: Path, time_s: float | None) -> tuple[str, float] | None:

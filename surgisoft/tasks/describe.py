@@ -17,6 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from surgisoft.config import to_table, write_atomically
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import DocumentedTask, Episodes, Signal, term_names
@@ -32,6 +34,11 @@ FAILS = (
     "finite, as after an action of NaN; its observations and rewards are then 0."
 )
 """How an episode of any task can end, too."""
+INFOS = (
+    "The info of a step holds those that apply (`info.get(NAME)` is None for another); vector "
+    "environments of Gymnasium mark them by `_NAME`, and in `batched_env` the others are NaN."
+)
+"""Where measures are."""
 
 
 @dataclass(frozen=True)
@@ -135,12 +142,20 @@ class TaskDescription:
     """State observer: fields of `config.world.observer`."""
     signals: tuple[Signal, ...] = ()
     """What an exported controller has to be given beside pressures and key points."""
+    measures: tuple[str, ...] = ()
+    """Names of the measures, with units, as in infos."""
+    measured: str = ""
+    """What the measures are."""
 
 
 def describe(name: str, config: Any = None) -> TaskDescription:
     """The facts of the named task; it is built, and started once, to know its sizes."""
     spec = spec_of(name)
     task = make_task(name, config)
+    episodes = Episodes(task)
+    start = episodes.seeded(0, 1)
+    still = {agent: torch.zeros(1, task.world.arms[agent].chambers) for agent in task.agents}
+    _, outcome = episodes.step(start, still)
     return TaskDescription(
         name=name,
         summary=_summary(spec.build),
@@ -152,6 +167,8 @@ def describe(name: str, config: Any = None) -> TaskDescription:
         randomisation=tuple(_settings(task.world.config.randomisation)),
         observer=tuple(_settings(task.world.config.observer)),
         signals=getattr(task, "signals", ()),
+        measures=tuple(outcome.measures),
+        measured=" ".join((inspect.getdoc(task.measures) or "").split()),
     )
 
 
@@ -298,6 +315,14 @@ def _page(task: TaskDescription) -> str:
     ]
     for name, agent in task.agents.items():
         lines += _agent_section(name, agent)
+    lines += [
+        "## Measures",
+        "",
+        f"{', '.join(f'`{name}`' for name in task.measures)}. {INFOS}",
+        "",
+        task.measured,
+        "",
+    ]
     lines += ["## Configuration", "", *_table(task.settings)]
     lines += ["## Domain randomization", "", "Fields of `world.randomisation`.", ""]
     lines += _table(task.randomisation)

@@ -11,7 +11,7 @@ from gymnasium.spaces import Box
 from gymnasium.spaces import Dict as DictSpace
 
 from surgisoft.errors import InputError, unknown_name
-from surgisoft.tasks.arguments import action_of
+from surgisoft.tasks.arguments import action_of, whole
 from surgisoft.tasks.base import (
     Episodes,
     LoneEpisode,
@@ -43,6 +43,8 @@ Bounds = tuple[Any, Any, tuple[int, ...], Any]
 FAILED = "failed"
 """Entry of a step's info: whether an arm was no longer finite, as after an action of NaN. The
 episode then ends with observations and rewards of zero."""
+EPISODE = "episode"
+"""Option of a reset: number of the episode within the seed, as `evaluate` counts them."""
 RGB_ARRAY = "rgb_array"
 """The render mode of the environments: pictures as arrays."""
 
@@ -76,6 +78,23 @@ class Pictures:
             one = rows(state, torch.tensor([index], device=state.world.steps.device))
             found.append(self._picture.image(one.world, trace_of(self._task, one)[0]))
         return tuple(found)
+
+
+def episode_number(seed: int | None, options: Mapping[str, Any] | None) -> int:
+    """The number of an episode within its seed from the options of a reset: `episode`, else 0.
+
+    Raises InputError where it is no whole number from 0 on, and for one without a seed.
+    """
+    given = (options or {}).get(EPISODE)
+    if given is None:
+        return 0
+    number = whole(f"option '{EPISODE}'", given, 0)
+    if seed is None:
+        raise InputError(
+            f"option '{EPISODE}' is {number} without a seed; expected both, as in "
+            f"reset(seed=7, options={{'{EPISODE}': {number}}})"
+        )
+    return number
 
 
 def entropy_seed() -> int:
@@ -121,9 +140,9 @@ class NumpyAdapter:
         return -limit, limit, (arm.chambers,), np.float32
 
     @torch.inference_mode()
-    def seeded(self, seeds: Sequence[int]) -> TaskState:
-        """Start episodes, one for each seed."""
-        parts = [streams(seed, 1, 0, self.task.world.device) for seed in seeds]
+    def seeded(self, seeds: Sequence[int], episode: int = 0) -> TaskState:
+        """Start episodes, one for each seed: that of this number, as `evaluate` counts them."""
+        parts = [streams(seed, 1, episode, self.task.world.device) for seed in seeds]
         return self.episodes.start(joined(parts))
 
     @torch.inference_mode()

@@ -21,6 +21,7 @@ from surgisoft.tasks.numpy_adapter import (
     NumpyAdapter,
     Pictures,
     entropy_seed,
+    episode_number,
     in_one,
 )
 from surgisoft.tasks.registry import task_of
@@ -32,8 +33,10 @@ class SurgicalEnv(ParallelEnv):
     Actions are changes of the commanded pressure (m,) float32, kPa. Observations are (D,) float32;
     `surgisoft.tasks.describe` lists their entries; with images they are dicts of that `vector` and
     of (H, W, C) arrays. Each agent's info holds its weighted reward
-    terms, the task's measures where they apply, and `failed`: whether the episode ended because an
-    arm was no longer finite, as after an action of NaN.
+    terms, the task's measures that apply, and `failed`: whether the episode ended because an
+    arm was no longer finite, as after an action of NaN. A measure that does not apply at a step,
+    such as the error while the reference waits, is left out, since NaN does not equal itself and
+    PettingZoo's test of seeds compares infos.
     """
 
     def __init__(self, task: Task, render_mode: str | None = None):
@@ -82,13 +85,16 @@ class SurgicalEnv(ParallelEnv):
     def reset(self, seed: int | None = None, options: dict | None = None):
         """Start an episode; returns observations and empty infos.
 
-        Without a seed the random number stream of the last episode continues.
+        Without a seed the random number stream of the last episode continues. options:
+        `{"episode": k}` starts episode k of the seed, as `surgisoft evaluate` counts them; default
+        0.
         """
-        state = self.task_state
+        state, number = self.task_state, episode_number(seed, options)
         if seed is None and state is not None:
             self._batch = self.adapter.restart(state)
         else:
-            self._batch = self.adapter.seeded([entropy_seed() if seed is None else seed])
+            first = entropy_seed() if seed is None else seed
+            self._batch = self.adapter.seeded([first], number)
         self.lone = self.adapter.alone(self._batch)
         self.agents = list(self.possible_agents)
         return self._observations(), {agent: {} for agent in self.agents}

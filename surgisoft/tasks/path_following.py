@@ -349,7 +349,7 @@ class Follow:
         return torch.zeros_like(state.world.failed)
 
     def measures(self, state: TaskState[FollowGoal]) -> dict[str, Tensor]:
-        """The error on the path; nan while the reference waits."""
+        """The error on the path; none while the reference waits (`approach_s`)."""
         return {
             "error_mm": self.error_mm(state).masked_fill(
                 state.world.steps <= self.approach, float("nan")

@@ -28,6 +28,7 @@ from surgisoft.tasks.numpy_adapter import (
     NumpyAdapter,
     Pictures,
     entropy_seed,
+    episode_number,
     in_one,
 )
 from surgisoft.tasks.observations import ObservationBlocks
@@ -105,7 +106,9 @@ class SingleEnv(gymnasium.Env):
     """One environment of a task. Actions (m,) kPa and observations (D,) are float32.
 
     The info of a step holds the weighted reward terms, the measures that apply, and `failed`:
-    whether the episode ended because the arm was no longer finite, as after an action of NaN.
+    whether the episode ended because the arm was no longer finite, as after an action of NaN. A
+    measure that does not apply at a step, such as the error while the reference waits, is left out:
+    `info.get("error_mm")` is then None.
     """
 
     metadata = {"render_modes": [RGB_ARRAY], "render_fps": 10}  # noqa: RUF012  (Gymnasium's form)
@@ -140,11 +143,16 @@ class SingleEnv(gymnasium.Env):
         self.action_space = Box(*self.adapter.action_bounds(self._agent))
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """Start an episode; returns (observation, empty info)."""
+        """Start an episode; returns (observation, empty info).
+
+        options: `{"episode": k}` starts episode k of the seed, as `surgisoft evaluate` counts them;
+        default 0.
+        """
+        number = episode_number(seed, options)
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(2**63))
-        self._state = self.adapter.seeded([seed])
+        self._state = self.adapter.seeded([seed], number)
         return in_one(self.adapter.observations(self._state)[self._agent]), {}
 
     def step(self, action: np.ndarray):

@@ -174,7 +174,7 @@ class TrackBody:
         return torch.zeros_like(state.world.failed)
 
     def measures(self, state: TaskState[Waves]) -> dict[str, Tensor]:
-        """Mean error of the key points, and the tip's error; nan while the reference waits."""
+        """Mean error of the key points, and the tip's; none while the reference waits."""
         errors, waits = self.errors_mm(state), state.world.steps <= self.approach
         return {
             "error_mm": errors.mean(1).masked_fill(waits, float("nan")),

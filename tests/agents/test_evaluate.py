@@ -11,12 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scipy.stats import binomtest
+from scipy.stats import binomtest, ttest_rel
 
 from surgisoft.agents.evaluate import (
     Evaluation,
     cell,
     cells_are,
+    differences,
     episode_table,
     student,
     summary,
@@ -24,10 +25,10 @@ from surgisoft.agents.evaluate import (
 )
 from surgisoft.agents.exact_checks import Contact, EpisodeCheck
 from surgisoft.agents.rollout import Rollout
-from surgisoft.agents.run_folder import PACKAGED
+from surgisoft.agents.run_folder import PACKAGED, RunFolder
 from surgisoft.agents.session import EvaluationRequest, evaluate
 from surgisoft.cli import run
-from surgisoft.errors import Interrupted
+from surgisoft.errors import InputError, Interrupted
 from surgisoft.scene.folder import open_scene
 from surgisoft.scene.spec import PHANTOM
 from surgisoft.surrogate.checkpoint import load_model, save_model
@@ -407,3 +408,67 @@ def test_the_command_imports_nothing_of_pictures_and_training():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "['torch']"
+
+
+def test_the_block_of_the_page_drives_the_episodes_of_evaluate(tmp_path, monkeypatch):
+    """docs/evaluate.md as it stands: episodes 0 and 1 of seed 7, here of a faster ring."""
+    page = (Path(__file__).parents[2] / "docs" / "evaluate.md").read_text()
+    (block,) = re.findall(r"^```python\n(.*?)^```", page, re.S | re.M)
+    packaged = RunFolder("ring")
+    shutil.copytree(packaged.path, tmp_path / "runs" / "ring")
+    quick = replace(packaged.plan().task_config, cut_s=10.0)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(RunFolder, "task", lambda run: make_task("circle_ablation", quick))
+    names = {}
+    exec(block, names)
+    found = evaluate("runs/ring", config=quick, episodes=2, seed=7, exact_checks=False)
+    expected = found.results[0].per_episode["beam_error_mean_mm"]
+    np.testing.assert_allclose(names["errors"], expected, rtol=0.01)
+    assert abs(expected[1] - expected[0]) > 0.02 * expected[0], "two episodes"
+    policy, seen = names["policy"], names["seen"]
+    both = policy.actions({"laser": np.stack([seen["laser"]] * 2)})["laser"]
+    np.testing.assert_allclose(both, [policy.actions(seen)["laser"]] * 2, atol=1e-5)
+    with pytest.raises(InputError, match=r"'laser' has shape \(3,\), expected \(\d+,\) or"):
+        policy.actions({"laser": np.zeros(3)})
+    with pytest.raises(InputError, match=r"unknown agent 'lazer'.*did you mean 'laser'"):
+        policy.actions({"lazer": seen["laser"]})
+
+
+def test_differences_are_those_of_the_same_episodes():
+    """The paired t test of scipy; an episode that one policy did not finish is left out."""
+    rng = np.random.default_rng(3)
+    hard = rng.uniform(1.0, 30.0, 12)
+    one, other = hard + rng.normal(0.0, 0.1, 12), hard - 0.5 + rng.normal(0.0, 0.1, 12)
+    other[4] = np.nan
+    both = [
+        Evaluation(name, {"error_mean_mm": error, "success": np.ones(len(error)), **more}, {}, None)
+        for name, error, more in (("a", one, {"x": one}), ("b", other[:10], {}))
+    ]
+    found = differences(*both)
+    assert list(found) == ["error_mean_mm"], "of both, and no rate"
+    known = np.delete(np.arange(10), 4)
+    expected = ttest_rel(other[known], one[known]).confidence_interval(0.95)
+    value = found["error_mean_mm"]
+    assert value.mean == pytest.approx((other - one)[known].mean())
+    assert (value.low, value.high) == pytest.approx((expected.low, expected.high))
+    assert (value.least, value.most) == ((other - one)[known].min(), (other - one)[known].max())
+    assert value.episodes == 9
+    assert value.high < 0.0, "although the two intervals of the means overlap"
+    assert summary("error_mean_mm", one).low < summary("error_mean_mm", other).high
+
+
+def test_a_policy_that_is_given_twice_is_told_and_differences_are_printed(tmp_path, capsys):
+    (tmp_path / "short.toml").write_text("[follow]\nloop_s = 0.6\napproach_s = 0.2\n")
+    command = ["evaluate", "random", "scripted", "random", "--task", "track_circle"]
+    command += ["--config", str(tmp_path / "short.toml"), "--episodes", "2"]
+    assert run([*command, "--json", str(tmp_path / "a.json")]) == 0
+    said = capsys.readouterr()
+    assert "policy random is given more than once; it is evaluated once" in said.err
+    found = json.loads((tmp_path / "a.json").read_text())
+    one, other = (found["policies"][name]["per_episode"] for name in ("random", "scripted"))
+    apart = np.subtract(other["error_mean_mm"], one["error_mean_mm"])
+    assert found["differences"]["scripted"]["error_mean_mm"]["mean"] == pytest.approx(apart.mean())
+    assert (
+        f"scripted minus random, episode by episode: error_mean_mm {apart.mean():.4g} "
+        f"({apart.min():.4g} to {apart.max():.4g})\n"
+    ) in said.out

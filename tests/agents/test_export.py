@@ -26,14 +26,14 @@ from surgisoft.agents.observer import ObserverGains
 from surgisoft.agents.on_rig import RigConfig
 from surgisoft.agents.presets import Plan, Preset
 from surgisoft.agents.rig_check import (
-    NUDGE_KPA,
     TOLERANCE_KPA,
     TOLERANCE_MM,
     Differences,
     RigCheck,
-    apart,
     check_on_rig,
+    closed_loop,
     drive,
+    replaying,
     same_measurements,
 )
 from surgisoft.agents.training import train_new
@@ -286,30 +286,58 @@ def test_a_wrong_constant_of_the_controller_shows_in_the_same_measurements(ring,
 
 
 def test_a_loop_that_amplifies_rounding_is_told_from_a_wrong_controller():
-    """What the policy differs from itself by explains ten times as much, and nothing else does."""
+    """The loops may differ as long as, given the same measurements, nothing does on either."""
     right, far = Differences(TOLERANCE_MM, TOLERANCE_KPA), Differences(0.35, 1.1)
     assert RigCheck(right, right, 456).passed
-    for itself, explained in ((Differences(0.04, 0.2), True), (Differences(0.03, 0.2), False)):
-        found = RigCheck(right, far, 456, itself)
-        assert found.amplified == found.passed == explained
-    assert not RigCheck(right, far, 456, Differences(0.04, 0.1)).passed
-    assert not RigCheck(right, Differences(np.nan, 0.0), 456, Differences(1.0, 1.0)).passed
+    found = RigCheck(right, far, 456, right)
+    assert found.amplified
+    assert found.passed
     assert not RigCheck(right, far, 456).passed
     for wrong in (Differences(1.1e-4, 0.0), Differences(0.0, 6e-4), Differences(0.0, np.nan)):
-        found = RigCheck(wrong, far, 456, Differences(0.3, 1.0))
+        assert not RigCheck(right, far, 456, wrong).passed
+        found = RigCheck(wrong, far, 456, right)
         assert found.amplified
         assert not found.passed
 
 
-def test_the_policy_itself_departs_after_one_command_was_rounded_otherwise(ring):
-    """One set point of 10^-6 kPa more: after a whole ring the endoscope is 0.02 mm away or more."""
+class Moved:
+    """A controller whose first command, or every later one, is more by so much."""
+
+    def __init__(self, controller, first_kPa=0.0, later_kPa=0.0):
+        self.controller, self.first_kPa, self.later_kPa = controller, first_kPa, later_kPa
+
+    def __getattr__(self, name):
+        return getattr(self.controller, name)
+
+    def begin(self, *given, **named):
+        command = self.controller.begin(*given, **named)
+        return {name: value + self.first_kPa for name, value in command.items()}
+
+    def step(self, *given, **named):
+        command = self.controller.step(*given, **named)
+        return {name: value + self.later_kPa for name, value in command.items()}
+
+
+@pytest.mark.parametrize("later_kPa", [0.0, 0.002])
+def test_a_loop_that_departs_by_rounding_passes_and_one_by_a_wrong_controller_does_not(
+    ring, later_kPa
+):
+    """One set point of 10^-6 kPa more: after a whole ring the endoscope is 0.02 mm away or more,
+    although at every decision the controller computes what the policy computes."""
     policy, task, episode = ring
-    config = replace(STRANGE, noise=1.0)
-    nudges = {episode.settled: NUDGE_KPA}
-    moved = drive(task, policy, config, build=ten_pictures_a_second, nudges=nudges)
-    found = apart(episode, moved)
-    assert found.points_mm > 200.0 * TOLERANCE_MM
-    assert found.explains(Differences(0.1, 0.1))
+    controller = running(ControllerGraph(task, policy.actors))
+    moved = Moved(controller, first_kPa=1e-6, later_kPa=later_kPa)
+    closed, rigs = closed_loop(moved, episode, ten_pictures_a_second)
+    assert closed.points_mm > 200.0 * TOLERANCE_MM
+    build = replaying(rigs, ten_pictures_a_second)
+    beside = drive(task, policy, replace(STRANGE, noise=1.0), build=build)
+    pressures, points = beside.measured(row := beside.settled + 100)
+    for name, rig in rigs.items():
+        np.testing.assert_array_equal(pressures[name], rig.samples[row][0].measured)
+        np.testing.assert_array_equal(points[name], rig.samples[row][0].key_points_mm)
+    own = same_measurements(moved, beside)
+    assert RigCheck(Differences(0.0, 0.0), closed, episode.decisions, own).passed == (not later_kPa)
+    assert own.commands_kPa == pytest.approx(later_kPa, abs=TOLERANCE_KPA)
 
 
 def wrong_files(monkeypatch, off, wrong):
@@ -330,6 +358,29 @@ def wrong_files(monkeypatch, off, wrong):
     monkeypatch.setattr(exporting, "write_torch_script", written)
     monkeypatch.setattr(exporting, "write_onnx", written)
     monkeypatch.setattr(exporting, "CHECKED", 8)
+
+
+def test_an_export_that_does_not_pass_its_check_leaves_the_folder_as_it_was(
+    policy, tmp_path, monkeypatch
+):
+    wrong_files(monkeypatch, 0.0, [])
+    monkeypatch.setattr(exporting, "Controller", lambda folder: (folder / "controller.py").exists())
+    seen = []
+
+    def refuse(controller):
+        seen.append(controller)
+        raise InputError("another command")
+
+    with pytest.raises(InputError, match="another command"):
+        export(policy, tmp_path / "out", check=refuse)
+    assert list(tmp_path.iterdir()) == []
+    files = export(policy, tmp_path / "out", check=seen.append)
+    (tmp_path / "out" / "controller.pt").write_text("of before")
+    with pytest.raises(InputError, match="another command"):
+        export(policy, tmp_path / "out", force=True, check=refuse)
+    assert (tmp_path / "out" / "controller.pt").read_text() == "of before"
+    assert sorted((tmp_path / "out").iterdir()) == sorted(files)
+    assert seen == [True] * 3
 
 
 @pytest.mark.parametrize("name", ["arm.pt", "arm.onnx"])

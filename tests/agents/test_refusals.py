@@ -189,7 +189,9 @@ def test_a_short_training_says_why_it_did_not_come_far(packaged):
         return shortfall(TrainedRun(packaged, Result(True, 100, 1.0, 1.0, best), True))
 
     assert said(success=1.0) == ""
-    assert "succeed in 50% of the episodes; train longer (" in said(success=0.5)
+    assert "succeed in 50% of the episodes; train a new run with more --steps (" in said(
+        success=0.5
+    )
     assert said(error_mm=1e-6) == ""
     assert "its error of 9 mm is above that of the arm model (" in said(error_mm=9.0)
     assert "no error could be measured in its evaluations" in said(error_mm=float("nan"))
@@ -202,7 +204,7 @@ def test_no_longer_training_is_advised_where_the_path_is_out_of_reach(packaged, 
     told = shortfall(TrainedRun(packaged, Result(True, 100, 1.0, 1.0, best), True))
     assert "% of the path of track_circle is out of the arm's reach" in told
     assert "make the path smaller (size_mm) or move its centre" in told
-    assert "train longer" not in told
+    assert "more --steps" not in told
 
 
 def test_an_unknown_policy_names_those_of_the_package():

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import shutil
 from types import SimpleNamespace
 
@@ -50,6 +51,12 @@ def test_evaluate_writes_one_self_contained_page(tmp_path, capsys):
     text = (tmp_path / "r" / "report.html").read_text()
     assert "Task track_circle, 2 episodes each. scripted: " in text
     assert "First episode of random" in text
+    cards = re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", text)
+    assert [name for name, _ in cards] == ["scripted: mean error", "random: mean error"]
+    assert f"scripted: mean error {cards[0][1]}; random: mean error {cards[1][1]}." in text
+    assert cards[0][1] != cards[1][1]
+    assert "Differences from scripted" in text
+    assert "random minus scripted" in text
     with chromium() as browser:
         for width in (1280, 400):
             overflow, foreign, broken, _ = look(browser, tmp_path / "r" / "report.html", width)

@@ -79,6 +79,25 @@ def test_on_an_organ_that_moves_the_error_is_that_on_the_tissue(monkeypatch):
     assert caption == "Largest 0.75 mm"
 
 
+def test_steps_at_which_no_error_is_measured_are_grey_and_not_the_largest(monkeypatch):
+    """The reference waits for two rows while the arm comes from 11.9 mm away."""
+    apart = np.array([11.9, 4.0, 0.05, 0.12, 0.1])
+    measured = np.where(np.arange(5) < 2, np.nan, apart)
+    log = SimpleNamespace(
+        measures={"error_mm": measured}, error_mm=apart, time_s=np.arange(5.0), beams={}
+    )
+    axis, caption = drawn(monkeypatch, lambda: error_chart(log))
+    counted, left_out = (line.get_ydata() for line in axis.lines)
+    np.testing.assert_array_equal(counted, measured)
+    np.testing.assert_array_equal(left_out, [11.9, 4.0, 0.05, np.nan, np.nan])
+    assert axis.get_ylim()[1] == pytest.approx(1.08 * 11.9)
+    assert caption == "Largest 0.12 mm; grey: the numbers do not count these steps"
+    log.measures["error_mm"] = apart
+    axis, caption = drawn(monkeypatch, lambda: error_chart(log))
+    assert len(axis.lines) == 1
+    assert caption == "Largest 11.9 mm"
+
+
 def test_targets_in_turn_are_points_and_the_way_between_them_has_no_gap(monkeypatch):
     """Three targets 12 to 14 mm apart, and an arm that passes between two of them in a step."""
     places = np.array([[8.0, 0.0, 0.0], [-4.0, 7.0, 0.0], [-4.0, -7.0, 0.0]])
@@ -96,6 +115,16 @@ def test_targets_in_turn_are_points_and_the_way_between_them_has_no_gap(monkeypa
     log.target_mm = np.stack((moving, moving**2 / 99.0, 0.0 * moving), axis=1)
     axis, _ = drawn(monkeypatch, lambda: path_chart(log))
     assert len(axis.lines) == 2, "one that moves has no such points"
+
+
+def test_lengths_over_several_decades_have_a_logarithmic_axis(monkeypatch):
+    """A learned policy beside the expert: their errors would lie on one spot at 0."""
+    groups = [("tc1", [5.0, 7.5]), ("scripted", [3.6e-6, 4.0e-6])]
+    axis, _ = drawn(monkeypatch, lambda: spread_chart("error", groups, "error mean [mm]"))
+    assert axis.get_xscale() == "log"
+    for label, values in (("error mean [mm]", [0.2, 5.0]), ("reward", [1e-6, 5.0])):
+        axis, _ = drawn(monkeypatch, lambda v=values, x=label: spread_chart(x, [("a", v)], x))
+        assert axis.get_xscale() == "linear"
 
 
 def test_shares_are_drawn_from_0_to_1(monkeypatch):

@@ -44,6 +44,9 @@ def test_trains_and_prints_the_result(tmp_path, capsys):
     assert (log.task, log.policy) == ("track_circle", "learned")
     assert len(log.time_s) > 100
     assert surgisoft(["train", "--resume", str(folder)]) == 0
+    capsys.readouterr()
+    assert surgisoft(["train", "--resume", str(folder), "--steps", "1000"]) == 2
+    assert "cannot go on to 1,000 steps" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

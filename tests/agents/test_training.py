@@ -288,6 +288,33 @@ def test_a_finished_run_stays_as_it_is(run):
     assert_equal(before, weights(run))
 
 
+def test_a_run_without_a_schedule_goes_on_to_more_steps_as_if_it_had_had_them(tmp_path):
+    """Weights, random numbers and episodes are the same to the bit."""
+    free = replace(TINY, last_noise=None)
+    whole = trained(tmp_path / "whole", plan_of(preset=free))
+    part = trained(tmp_path / "part", plan_of(turns=2, preset=free))
+    before = (part.path / "config.json").read_bytes()
+    for steps, said in ((128, "--steps is 128, and .* started with 128"), (64, "expected more")):
+        with pytest.raises(InputError, match=said):
+            resume(part.path, Processes(), CPU, steps=steps)
+    assert (part.path / "config.json").read_bytes() == before
+    found = resume(part.path, Processes(), CPU, steps=256)
+    assert (found.done, found.updates, found.steps) == (True, 2, 256)
+    saved, longer = (RunFolder(run.path).load(LAST) for run in (whole, part))
+    for one in (saved, longer):
+        del one["wall_s"], one["cpu_s"]
+    assert same(saved, longer)
+    assert RunFolder(part.path).plan().steps == 256
+
+
+def test_a_run_with_a_schedule_of_its_noise_is_not_made_longer(run):
+    before = (run.path / "config.json").read_bytes()
+    said = r"cannot go on to 9,999 steps.* --task track_circle --preset fast --seed 0 --steps 9999"
+    with pytest.raises(InputError, match=said):
+        resume(run.path, Processes(), CPU, steps=9999)
+    assert (run.path / "config.json").read_bytes() == before
+
+
 @pytest.fixture(scope="module")
 def ablation():
     return make_task("circle_ablation")

@@ -134,10 +134,12 @@ def test_evaluate_prints_a_column_for_each_policy(capsys, monkeypatch):
     scripted = SimpleNamespace(
         policy="scripted", overall={"success": summary(0.5), "error_mm": summary(0.25)},
         checks=object(), to_json=lambda: {"exact_checks": facts},
+        per_episode={"error_mean_mm": np.full(6, 0.25)}, episodes=6,
     )  # fmt: skip
     learned = SimpleNamespace(
-        policy="runs/ring", overall={"success": summary(NAN, 0)}, checks=None, to_json=dict
-    )
+        policy="runs/ring", overall={"success": summary(NAN, 0)}, checks=None, to_json=dict,
+        per_episode={"error_mean_mm": np.array([1.0, 1.5] * 3)}, episodes=6,
+    )  # fmt: skip
     found = result(
         task="track_circle", results=[scripted, learned], success_rule="within 1 mm",
         measured_arms=("arm",), logs={}, request=SimpleNamespace(seed=4),
@@ -149,6 +151,8 @@ def test_evaluate_prints_a_column_for_each_policy(capsys, monkeypatch):
     assert re.search(r"^ +scripted +ring\n", out, re.M)
     assert re.search(r"success +50\.0% \[40\.0%, 60\.0%\] +-\n", out)
     assert re.search(r"error_mm +0\.25 \[0\.15, 0\.35\] +-\n", out)
+    # Student's interval of 0.75 and 1.25, three times each: 1 +- 2.5706 * sqrt(0.075 / 6)
+    assert "ring minus scripted, episode by episode: error_mean_mm 1 [0.7126, 1.287]\n" in out
     assert "of 10 instants the batched geometry differs on contact in 1 and on what the" in out
     assert "success: within 1 mm\n" in out
     assert "arm: on a real bench, whose true body is not known" in out
@@ -770,24 +774,50 @@ def test_an_export_without_a_controller_says_why(tmp_path, capsys, monkeypatch):
     assert out.endswith(f"wrote {tmp_path / 'policy.onnx'}\n")
     assert run(["export", "runs/x", "-o", str(tmp_path), "--check"]) == 1, "what was asked for"
     assert "not exported" in capsys.readouterr().out
-    (tmp_path / "controller.py").touch()
-    monkeypatch.setattr("surgisoft.agents.controller_runner.Controller", lambda folder: None)
+
+
+def test_the_check_of_an_export_says_what_was_compared_and_keeps_no_wrong_file(
+    tmp_path, capsys, monkeypatch
+):
+    run_of = SimpleNamespace(task=lambda: None)
+    monkeypatch.setattr(
+        "surgisoft.agents.learned.LearnedPolicy", lambda *_, **__: SimpleNamespace(run=run_of)
+    )
+
+    def exported(policy, output, task, force, check):
+        check(None)
+        (tmp_path / "controller.py").touch()
+        return [tmp_path / "policy.onnx"]
+
+    monkeypatch.setattr("surgisoft.agents.export.export", exported)
     right, far = Differences(1.5e-5, 0.00013), Differences(0.35, 1.1)
-    itself = Differences(0.29, 1.4)
     for check, code, told in (
-        (RigCheck(right, Differences(3e-5, 9e-5), 30), 0, "true key points 3e-05 mm\nwrote"),
-        (RigCheck(right, far, 456, itself), 0, "the policy differs as much from itself\nwrote"),
-        (RigCheck(right, far, 456, itself, 0.00013), 0, "moved at random by up to 0.00013 kPa: "),
-        (RigCheck(right, far, 456, right, 0.00013), 1, "what the policy does not do\nwrote"),
-        (RigCheck(far, far, 456, itself), 1, "does not compute what the policy computes\nwrote"),
+        (RigCheck(right, Differences(3e-5, 9e-5), 30), 0, "does in the loop what the policy does"),
+        (RigCheck(right, far, 456, right), 0, "because the robot amplifies rounding"),
+        (RigCheck(right, far, 456, far), 1, "given the measurements of its own closed loop, "),
+        (RigCheck(far, far, 456), 1, "given the measurements of the policy's episode, "),
     ):
+        (tmp_path / "controller.py").unlink(missing_ok=True)
         monkeypatch.setattr("surgisoft.agents.rig_check.check_on_rig", lambda *_, it=check: it)
         assert run(["export", "runs/x", "-o", str(tmp_path), "--check"]) == code
-        out = capsys.readouterr().out
-        assert f"same measurements: commands {check.same.commands_kPa:.2g} kPa, estimated" in out
-        assert f"closed loop: commands {check.closed.commands_kPa:.2g} kPa, true key" in out
-        assert told in out
-    assert out.endswith(f"wrote {tmp_path / 'policy.onnx'}\n")
+        *numbers, verdict, last = capsys.readouterr().out.splitlines()
+        assert numbers[1].startswith(
+            f"same measurements: commands {check.same.commands_kPa:.2g} kPa, estimated key points "
+        )
+        assert numbers[2] == (
+            f"closed loop: commands {check.closed.commands_kPa:.2g} kPa, true key points "
+            f"{check.closed.points_mm:.2g} mm"
+        )
+        if check.own is not None:
+            assert numbers[3].endswith(
+                f"closed loop: commands {check.own.commands_kPa:.2g} kPa, estimated key points "
+                f"{check.own.points_mm:.2g} mm"
+            )
+        assert verdict.startswith("failed: " if code else "passed: ")
+        assert told in verdict
+        wrote = f"wrote {tmp_path / 'policy.onnx'}"
+        assert last.startswith(f"no file was written to {tmp_path}; without" if code else wrote)
+        assert (tmp_path / "controller.py").exists() == (code == 0)
 
 
 def test_an_interrupted_recording_says_where_its_log_is(tmp_path, capsys, monkeypatch):
@@ -952,13 +982,14 @@ def test_each_policy_has_a_replay_of_its_own(tmp_path, capsys, monkeypatch):
     assert asked == [names]
     assert made == {
         "r.v2-scripted.rrd": "log of scripted",
-        "r.v2-run.rrd": "log of a/run",
-        "r.v2-run-3.rrd": "log of b/run",
+        "r.v2-a-run.rrd": "log of a/run",
+        "r.v2-b-run.rrd": "log of b/run",
     }
-    assert f"wrote {tmp_path / 'r.v2-run-3.rrd'}" in capsys.readouterr().out
-    made.clear()
-    assert run(["evaluate", "scripted", "--task", "track_circle", "--replay", file]) == 0
-    assert made == {"r.v2.rrd": "log of scripted"}
+    assert f"wrote {tmp_path / 'r.v2-b-run.rrd'}" in capsys.readouterr().out
+    for one in (["scripted"], ["scripted", "scripted"]):
+        made.clear()
+        assert run(["evaluate", *one, "--task", "track_circle", "--replay", file]) == 0
+        assert made == {"r.v2.rrd": "log of scripted"}
 
 
 def test_a_file_given_twice_is_in_the_next_command_once(bench, capsys, monkeypatch):

@@ -23,7 +23,13 @@ from surgisoft.replay.colours import (
     tissue_colours,
 )
 from surgisoft.replay.endoscope import PIXELS, camera_entity, cone_entity
-from surgisoft.replay.episode_view import hiding_bodies, legend, viewpoint, write_replay
+from surgisoft.replay.episode_view import (
+    episode_blueprint,
+    hiding_bodies,
+    legend,
+    viewpoint,
+    write_replay,
+)
 from surgisoft.replay.plots import plots_of
 from surgisoft.replay.surfaces import dosed_surface
 from surgisoft.replay.viewer import take_screenshot
@@ -348,6 +354,23 @@ def test_the_plot_of_shares_is_named_by_what_is_in_it(log):
     done = {name: each for name, each in log.measures.items() if name != "view_fraction"}
     titles = [plot.title for plot in plots_of(replace(log, measures=done))]
     assert "Done (share)" in titles
+
+
+def test_a_row_is_as_high_as_its_legends_need(log):
+    """Six pressures and commands of an arm; the rewards of two agents fit beside each other."""
+    plots = plots_of(log)
+    (_, right) = episode_blueprint(log, plots).root_container.contents
+    picture, pressures, shares, last = right.row_shares
+    assert (picture, shares) == (1.5, 1.0)
+    assert 1.2 <= pressures < 1.5
+    assert last >= 1.0
+    rewards = [plot.title for plot in plots if plot.group]
+    assert rewards == ["Reward: laser", "Reward: endoscope"]
+    chambers = replace(log.arms["laser"], pressure_kPa=np.zeros((log.rows, 6)),
+                       command_kPa=np.zeros((log.rows, 6)))  # fmt: skip
+    many = replace(log, arms={**log.arms, "laser": chambers})
+    (_, right) = episode_blueprint(many, plots_of(many)).root_container.contents
+    assert right.row_shares[1] > pressures
 
 
 def test_pressure_lines_are_named(log):

@@ -7,7 +7,7 @@ import pytest
 import rerun as rr
 import rerun.blueprint as rrb
 
-from surgisoft.replay.recording import new_recording
+from surgisoft.replay.recording import event_lines, new_recording
 from surgisoft.replay.viewer import viewer_command
 
 TASKS = Path("/proc/self/task")
@@ -36,3 +36,11 @@ def test_the_layout_is_active_and_not_only_the_default(tmp_path):
     printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     activations = [line for line in printed.splitlines() if "BlueprintActivationCommand" in line]
     assert ["make_active: true" in line for line in activations] == [True]
+
+
+def test_long_events_have_lines_that_the_viewer_shows_whole():
+    text = "circle_ablation by runs/long_name in simulation"
+    first, *rest = event_lines(3.25, text, 30)
+    assert first == "   3.2 s  circle_ablation by"
+    assert all(line.startswith(" " * 10) and len(line) <= 40 for line in rest)
+    assert " ".join(line[10:] for line in (first, *rest)) == text

@@ -23,6 +23,27 @@ def test_the_newest_replay_of_a_run_is_found(tmp_path):
     assert find_replay(places[0]) == places[0]
 
 
+@pytest.mark.parametrize(
+    ("there", "hint"),
+    [
+        (["ring-ring.rrd", "ring-random.rrd", "other.rrd"], "ring-random.rrd or {}/ring-ring.rrd?"),
+        (["rings.rrd", "unlike.npz", "ring.txt"], "rings.rrd?"),
+        (["unlike.npz", "ring.txt"], None),
+    ],
+)
+def test_a_missing_replay_is_told_with_those_of_its_name(tmp_path, there, hint):
+    """First those that `evaluate --replay` wrote for several policies."""
+    for name in there:
+        (tmp_path / name).write_bytes(MAGIC)
+    with pytest.raises(InputError) as told:
+        find_replay(tmp_path / "ring.rrd")
+    missing = (
+        f"{tmp_path / 'ring.rrd'}: there is no such file or folder; expected a replay or a run"
+    )
+    more = f"; did you mean {tmp_path}/{hint.format(tmp_path)}" if hint else ""
+    assert str(told.value) == missing + more
+
+
 def test_a_picture_that_cannot_be_written_is_told_before_the_replay_is_made(tmp_path, monkeypatch):
     (tmp_path / "a.npz").touch()
     (tmp_path / "b.png").mkdir()

@@ -19,9 +19,10 @@ from surgisoft.scene.batched import BatchedScene, LoneScene
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import CollisionChecker, ExactScene, LoneExact
 from surgisoft.scene.spec import PHANTOM
+from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.parallel import SurgicalEnv, parallel_env
 from surgisoft.tasks.path_following import FollowConfig
-from surgisoft.tasks.registry import TASKS
+from surgisoft.tasks.registry import TASKS, make_task
 from surgisoft.tasks.single import BatchedEnv, SingleEnv
 from surgisoft.tasks.track import TrackConfig
 
@@ -139,6 +140,25 @@ def test_a_reset_without_a_seed_is_another_episode():
     assert not np.array_equal(one["arm"], other["arm"])
 
 
+def test_the_option_episode_starts_that_episode_of_the_seed():
+    """As the streams of a rollout are counted: episode 3 of seed 7, which no other seed has."""
+    task = make_task("track_circle")
+    episodes = Episodes(task)
+    expected = episodes.observe(episodes.seeded(7, 4))["arm"].numpy()
+    env, single = SurgicalEnv(task), SingleEnv(task)
+    for number in (0, 3):
+        seen, _ = env.reset(seed=7, options={"episode": number})
+        np.testing.assert_allclose(seen["arm"], expected[number], atol=1e-5)
+        seen, _ = single.reset(seed=7, options={"episode": number})
+        np.testing.assert_allclose(seen, expected[number], atol=1e-5)
+    assert np.abs(env.reset(seed=10)[0]["arm"] - expected[3]).max() > 1e-3
+    for one in (env, single):
+        with pytest.raises(InputError, match="option 'episode' is -1, expected 0 or more"):
+            one.reset(seed=7, options={"episode": -1})
+        with pytest.raises(InputError, match="option 'episode' is 2 without a seed; expected both"):
+            one.reset(options={"episode": 2})
+
+
 @one_arm
 def test_gymnasium_checker(name):
     with warnings.catch_warnings():
@@ -230,6 +250,32 @@ def test_a_nan_action_ends_one_environment_only():
     assert info["failed"].tolist() == [False, True, False], "the reason"
     assert info["_failed"].all()
     assert not many.step(np.zeros((3, 3), np.float32))[2].any()
+
+
+@pytest.mark.parametrize("name", ["track_circle", "circle_ablation"])
+def test_infos_have_the_measures_that_apply(name):
+    """Those that a batch has as numbers: not the error while the reference waits for 0.5 s, nor
+    that of a beam that is off."""
+    config = SHORT if name == "track_circle" else None
+    measure = "error_mm" if name == "track_circle" else "beam_error_mm"
+    batch, env = surgisoft.batched_env(name, 1, config=config, seed=4), parallel_env(name, config)
+    env.reset(seed=4)
+    still = {agent: np.zeros(3, np.float32) for agent in env.possible_agents}
+    one, many = [], []
+    for _ in range(8):
+        *_, infos = env.step(still)
+        step = batch.step({agent: value[None] for agent, value in still.items()})
+        known = {key for key, value in step.measures.items() if value.isfinite().all()}
+        for info in infos.values():
+            assert set(step.measures) & set(info) == known
+        one.append(infos[env.possible_agents[0]].get(measure))
+        many.append(step.measures[measure].item())
+    assert [value is None for value in one] == [name != "track_circle" or k < 5 for k in range(8)]
+    np.testing.assert_allclose(np.array(one, float), many, rtol=1e-3)
+    if name == "track_circle":
+        single = SingleEnv(name, config)
+        single.reset(seed=4)
+        assert measure not in single.step(np.zeros(3, np.float32))[-1]
 
 
 @pytest.mark.parametrize("geometry", ["fcl", "batched"])

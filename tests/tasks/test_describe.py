@@ -40,6 +40,8 @@ def test_blocks_cover_the_whole_observation_and_terms_the_whole_reward(name):
             assert block.meaning
         assert all(term.meaning for term in facts.rewards)
     assert all(setting.meaning for setting in (*told.settings, *told.randomisation))
+    assert told.measures == tuple(outcome.measures)
+    assert told.measured
 
 
 def test_indices_and_scales_by_hand():

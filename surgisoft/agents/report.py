@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from surgisoft.agents.evaluate import (
+    FEW,
     RATES,
     WHAT_CELLS_ARE,
     Evaluation,
@@ -32,7 +33,8 @@ UNITS = {"_mm": "mm", "_mm2": "mm²", "_s": "s"}
 PAIRED = (
     "All policies have the same episodes, so that each number is subtracted episode by episode; "
     "the mean of the differences has Student's 95 % interval of paired samples. Where it does not "
-    "contain 0, the policies differ. Rates are left out."
+    f"contain 0, the policies differ. Of fewer than {FEW} episodes the least and the greatest "
+    "difference are in round brackets instead. Rates are left out."
 )
 """How to read the table of differences."""
 HOW = WHAT_CELLS_ARE + (

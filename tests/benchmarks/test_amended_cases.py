@@ -111,7 +111,7 @@ def test_the_sources_that_took_no_part_are_judged_by_the_decision_in_force(monke
     monkeypatch.setattr(amended_cases, "fit", kept)
     monkeypatch.setattr(amended_cases, "model_of", lambda values: fitted_decision())
     asked = statements("mujoco")  # of both kinds of models those of the defaults
-    assert len(asked) == 105
+    assert len(asked) == 209
     assert {one.case.models for one in asked} == {"default"}
     assert "mujoco" not in {case.source for case in fitted_to}
     assert {"strain_rod", "own_rig"} < {case.source for case in fitted_to}

@@ -41,6 +41,7 @@ from surgisoft.surrogate.callables.predicted import PredictedNetwork, monomials,
 from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel, Validation
+from surgisoft.surrogate.reach import SAME_LENGTH
 from surgisoft.units import MM_PER
 
 FIT_ROWS = 4000
@@ -67,10 +68,6 @@ LENGTH_UNITS = tuple(
 """Wrong readings of a model's key points: the true unit, and the one that they were read as."""
 COLUMNS_BY_UNIT = "expected columns named by the unit of their values, such as k0_x_mm or k0_x_m"
 """What to do about a file of predictions in another unit than its columns say."""
-SAME_LENGTH = 1.5
-"""Ratio up to which the body of a model and the measured one are equally long, once a wrong unit of
-length is corrected: an arm that stretches is longer than at rest. Its square is less than the
-smallest ratio of two factors that are tried (2.54), so that one factor at most is found."""
 
 Given = Iterable[Recording | str | Path] | Recording | str | Path
 """Recordings, their files, or folders of them."""

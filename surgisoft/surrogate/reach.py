@@ -15,8 +15,9 @@ COUNTS = {1: 41, 2: 41, 3: 15, 4: 8, 5: 6, 6: 5}
 LEAST_BODY_MM = 3.0
 """A body below this length, at rest, is in another unit than mm: no arm with a tool is so short."""
 SAME_LENGTH = 1.5
-"""Ratio up to which the body of a model has the length that the model states, once a wrong unit is
-corrected: an arm that stretches is longer than at rest."""
+"""Ratio up to which the body of a model has the stated or measured length, once a wrong unit is
+corrected: an arm that stretches is longer than at rest. Its square is less than the smallest ratio
+of two factors that are tried (2.54), so that one factor at most is found."""
 
 
 def model_table(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -33,7 +34,7 @@ from surgisoft.units import actuation_word
 from surgisoft.viewpoint import upright
 
 MOST_ROWS = 6000
-"""Longer comparisons are thinned evenly to so many rows."""
+"""Of longer comparisons so many rows are shown, one in each of as many equal parts (`_thinned`)."""
 LINE_MM = 2.0
 """Spacing of the drawn centreline's points (mm)."""
 MEASURED_WIDE, PREDICTED_WIDE, POINT_WIDE, ARROW_WIDE, BAR_WIDE = 0.008, 0.012, 0.014, 0.006, 0.005
@@ -101,16 +102,17 @@ def write_comparison(
     models = {label: np.asarray(points, float) for label, points in models.items()}
     for points in models.values():
         _check(t_s, measured, points)
-    keep = np.unique(np.linspace(0, len(t_s) - 1, min(len(t_s), MOST_ROWS)).round().astype(int))
+    whole = {label: np.linalg.norm(points - measured, axis=-1) for label, points in models.items()}
+    scale = error_scale(measured, list(whole.values()), large_mm)
+    keep = _thinned(*whole.values())
     time_s = continued(t_s)[keep]
     measured = measured[keep]
     models = {label: points[keep] for label, points in models.items()}
-    errors = {label: np.linalg.norm(points - measured, axis=-1) for label, points in models.items()}
-    scale = error_scale(measured, list(errors.values()), large_mm)
+    errors = {label: error[keep] for label, error in whole.items()}
     pressure = None if pressure is None else np.asarray(pressure, float)[keep]
     lines = _lines(errors, pressure, unit)
     view = View(measured, gravity, BARS_SHARE * scale.body_mm)
-    blueprint = _layout(view, errors, lines, scale, float(time_s[-1]), bool(seen), bool(events))
+    blueprint = _layout(view, whole, lines, scale, float(time_s[-1]), bool(seen), bool(events))
     with new_recording(path, "surgisoft_comparison", name, blueprint) as recording:
         columns = Columns(recording, time_s)
         recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -159,12 +161,12 @@ def write_change(
     t_s, before, after, explained = (np.asarray(x, float) for x in given)
     _check(t_s, before, after)
     _check(t_s, before, before + explained)
-    keep = np.unique(np.linspace(0, len(t_s) - 1, min(len(t_s), MOST_ROWS)).round().astype(int))
-    time_s = continued(t_s)[keep]
-    before, after, explained = before[keep], after[keep], explained[keep]
-    change = after - before
-    size = np.linalg.norm(change, axis=-1)
+    size = np.linalg.norm(after - before, axis=-1)
     large = quantile(size)
+    keep = _thinned(size)
+    time_s = continued(t_s)[keep]
+    before, after, explained, size = before[keep], after[keep], explained[keep], size[keep]
+    change = after - before
     stretch, body = stretch_of(before, large), body_size(before)
     along = _main_direction(change[:, -1])
     lines = {
@@ -207,6 +209,22 @@ def _log_arrows(columns: Columns, entity: str, origins, vectors, colour, body_mm
     columns.recording.log(entity, style, static=True)
     arrows = rr.Arrows3D.columns(origins=origins[known], vectors=vectors[known])
     columns.send(entity, rows, arrows.partition(counts[rows]))
+
+
+def _thinned(*errors_mm: np.ndarray) -> np.ndarray:
+    """(K,) rows to show, at most `MOST_ROWS`, in order.
+
+    errors_mm: (T, n) each, NaN where nothing was measured. Between the first and the last row, of
+    each of as many equal parts the row with the largest error is kept: a peak of one row is seen.
+    """
+    rows = len(errors_mm[0])
+    if rows <= MOST_ROWS:
+        return np.arange(rows)
+    seen = [np.where(np.isfinite(each), each, -1.0).max(axis=1) for each in errors_mm]
+    largest = np.max(seen, axis=0)
+    edges = np.linspace(1, rows - 1, MOST_ROWS - 1).round().astype(int)
+    inner = [a + largest[a:b].argmax() for a, b in itertools.pairwise(edges)]
+    return np.array([0, *inner, rows - 1])
 
 
 def _check(t_s, measured, predicted) -> None:

@@ -212,6 +212,23 @@ def test_long_comparisons_are_thinned_and_one_key_point_will_do(tmp_path):
     assert path.stat().st_size < 2e6
 
 
+@pytest.mark.parametrize("row", [1, 3000, 3001, 2 * MOST_ROWS - 2])
+def test_a_peak_of_one_row_is_in_the_replay_of_a_long_comparison(row, tmp_path):
+    rows = 2 * MOST_ROWS
+    measured = np.zeros((rows, 2, 3))
+    predicted = np.full((rows, 2, 3), [0.1, 0.0, 0.0])
+    predicted[row, 1] = [0.0, 7.0, 0.0]
+    measured[5, 0] = np.nan
+    path = tmp_path / "peak.rrd"
+    write_comparison(np.arange(rows), measured, predicted, "peak", path)
+    errors = column(path, "/plots/error/model1/k1", "Scalars:scalars", "time")
+    assert len(errors) == MOST_ROWS
+    assert errors[row * 10**9] == pytest.approx([7.0])
+    write_change(np.arange(rows), measured, predicted, 0.0 * measured, "peak", path)
+    sizes = column(path, "/plots/size/k1", "Scalars:scalars", "time")
+    assert sizes[row * 10**9] == pytest.approx([7.0])
+
+
 def test_what_does_not_fit_is_one_line(tmp_path):
     t_s, measured, predicted = made_up()
     path = tmp_path / "c.rrd"

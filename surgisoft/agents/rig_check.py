@@ -7,14 +7,14 @@ differ by rounding alone.
 Closed loop: the same robot, with the same history, is driven a second time by the controller, from
 its own samples. Rounding now comes back through the robot. Arm models with a direction of pressure
 change jump where it reverses, and sensors read in steps, so that a policy may rest beside a
-reversal at an unstable equilibrium: what differs grows there from decision to decision, until two
-courses of the same policy are as far apart as two courses can be. How far the loops are apart then
-says nothing about the controller.
+reversal at an unstable equilibrium: a difference grows there from decision to decision, until two
+trajectories of the same policy are as far apart as any two can be. The distance between the loops
+then says nothing about the controller.
 
-Own course: therefore, where the loops differ, the policy is given the samples of the controller's
-own loop, and both are compared at every decision of it, as given the same measurements. Where they
-agree, the controller's loop is that of the policy with every command rounded by no more than this:
-the robot makes the rest of the difference.
+The controller's own loop: where the loops differ, the policy is therefore given the samples of the
+controller's loop, and both are compared at every decision of it, with the limits of the same
+measurements. If they agree, the controller does what the policy does with commands rounded by no
+more than these limits, and the robot makes the rest of the difference.
 """
 
 from __future__ import annotations

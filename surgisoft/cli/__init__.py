@@ -180,9 +180,10 @@ def _of_value(error: TyperException) -> str:
     if expected == "a whole number":
         with suppress(ValueError):
             if (number := float(given)).is_integer() and abs(number) < LARGEST_WRITTEN:
-                expected += f" in digits, {int(number)}"
-    option = error.format_message().removeprefix("Invalid value for ").partition(": ")[0]
-    return one_line(f"{option.replace(chr(39), '')} is {given[:60]!r}, expected {expected}")
+                expected += f", such as {int(number)}"
+    quoted = error.format_message().removeprefix("Invalid value for ").partition(": ")[0]
+    option = quoted.replace("'", "")
+    return one_line(f"{option} is {given[:60]!r}, expected {expected}")
 
 
 def _usage(error: TyperException, many: list[str]) -> int:

@@ -47,7 +47,7 @@ from surgisoft.tasks.episodes.log import JUMP_MM, DoseLog, EpisodeLog
 PICTURE_HEIGHT = 1.5
 """Height of the row with the endoscope's picture, in those of a row of plots."""
 FITTING_LINES = 5
-"""Lines of a legend that a row of plots shows; more were cut off."""
+"""Lines of a legend that a row of plots has room for; the viewer cuts off further ones."""
 LINE_HEIGHT = 0.25
 """Height that each further line takes, in rows of plots; where other rows are taller too."""
 EVENT_COLUMNS = (52, 34)

@@ -496,7 +496,7 @@ def test_a_recording_that_is_there_is_refused_before_the_rig_moves(tmp_path, mon
 @pytest.mark.parametrize(
     ("option", "told"),
     [
-        ("--steps 1e5", "--steps is '1e5', expected a whole number in digits, 100000"),
+        ("--steps 1e5", "--steps is '1e5', expected a whole number, such as 100000"),
         ("--steps 2.5", "--steps is '2.5', expected a whole number"),
         ("--steps 1e999", "--steps is '1e999', expected a whole number"),
         ("--minutes x", "--minutes is 'x', expected a number"),

@@ -14,8 +14,10 @@ square); signs and places vary with the robot's seed. The laws, and those of the
 | `misalignment` | rotation and shift of the cameras: coincides | rotation, shift, scale |
 | `rate_dependence` | dashpots of a power of the rate in the joints (Ostwald 1929) | Ellis' fluid |
 | `contact` | a round post with Hertz' (1881) law | one key point and a plane |
-| `softening` | damage rational in the largest energy (Simo 1987) | exponential in energy |
-| `coupling` | a chamber is pressed in by higher pressure next to it | polynomial of loads |
+| `softening` | damage rational in the largest energy (Simo 1987) | exponential or inverse root \
+in energy |
+| `coupling` | a chamber is pressed in by higher pressure next to it, exponentially | \
+polynomial of loads; of their difference |
 | `dead_zone` | bladder that pushes from a pressure on: a corner | smoothed by a root |
 | `drift` | base that turns with the root of time (Fick 1855: swelling) | saturating exponential |
 | `stiffening` | polynomial of strain (Yeoh 1993) in the joints | exponential (Fung) on loads |

@@ -16,7 +16,7 @@ along the loads. The laws and what they differ in from the effects of the arm mo
 | `creep` | power law of time as a fractional kernel (Scott Blair 1947) | sums of retarded elements |
 | `rate_dependence` | Zener solid with Eyring's (1936) sinh dashpot | Kelvin-Voigt, Ellis fluid |
 | `stiffening` | limited chains (Gent 1996, in bending) | exponential (Fung) |
-| `softening` | exp(-b sqrt(M - m)) (Beatty & Krishnaswamy 2000) | energy, exponential (Ogden & Roxburgh) |
+| `softening` | exp(-b sqrt(M - m)) (Beatty & Krishnaswamy 2000) | energy, exponential (Ogden & Roxburgh) or inverse root |
 | `payload` | weight at the tip, equilibrium of the deformed rod; a weight coincides | beam, displacement to first order |
 | `contact` | unilateral spring between key points, in equilibrium | displacement of the beam to first order |
 | `twist` | torsion by the mean square of the loads | by the mean load |

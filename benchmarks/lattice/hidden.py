@@ -15,8 +15,10 @@ models:
 | `misalignment` | rotation and shift of the cameras: coincides | rotation, shift, scale |
 | `rate_dependence` | fluid of Cross (1965) in series with springs | Ellis' fluid |
 | `contact` | a soft ball that dents the wall, node by node | one key point and a plane |
-| `softening` | filaments that break when stretched (Daniels 1945) | exponential in energy |
-| `coupling` | torn ribs: chambers bulge into their neighbours | polynomial of loads |
+| `softening` | filaments that break when stretched (Daniels 1945) | exponential or inverse root \
+in energy |
+| `coupling` | torn ribs: chambers bulge into their neighbours | polynomial of loads; of their \
+difference |
 | `dead_zone` | bladders that touch the wall later towards the tip | smoothed by a root |
 | `drift` | base that turns with the cube root of time (Andrade 1910) | saturating exponential |
 | `stiffening` | crimped threads that become taut (Lanir 1979) | exponential (Fung) of loads |

@@ -18,9 +18,10 @@ log-normal spectrum |
 | `misalignment` | rotation and shift of the cameras: coincides | rotation, shift, scale |
 | `rate_dependence` | joint damping that grows with the rate: MuJoCo's polynomial | Ellis' fluid |
 | `contact` | a rough ball beside the arm: MuJoCo's contact | one key point and a plane |
-| `softening` | damage in proportion to a joint's largest bending (Kachanov 1958) | exponential in \
-energy |
-| `coupling` | walls between chambers bulge as membranes (Hencky 1915) | polynomial of loads |
+| `softening` | damage in proportion to a joint's largest bending (Kachanov 1958) | exponential or \
+inverse root in energy |
+| `coupling` | walls between chambers bulge as membranes, the cube root of the difference of \
+pressures (Hencky 1915) | polynomial of loads; of their difference or its root |
 | `dead_zone` | parts of a bladder touch the wall one after the other | smoothed by a root |
 | `drift` | mount that creeps with the logarithm of time (Phillips 1905) | saturating exponential |
 | `stiffening` | joints whose stiffness grows with the square of bending: MuJoCo's polynomial | \

@@ -19,9 +19,10 @@ log-normal spectrum |
 | `rate_dependence` | fluid of Powell & Eyring (1944) beside the wall | Ellis' fluid |
 | `contact` | a plate that stiffens exponentially, along the whole body (Winkler 1867) | one key \
 point and a plane |
-| `softening` | chains pulled out of hard domains (Qi & Boyce 2004) | exponential in energy |
+| `softening` | chains pulled out of hard domains (Qi & Boyce 2004) | exponential or inverse root \
+in energy |
 | `coupling` | septa that move at a constant section of all chambers (Laplace 1806) | polynomial \
-of loads |
+of loads; of their difference |
 | `dead_zone` | threads of a fabric that become taut at logistic lengths (Verhulst 1838) | \
 smoothed by a root |
 | `drift` | base that turns with a hyperbola of time (Ross 1937) | saturating exponential |

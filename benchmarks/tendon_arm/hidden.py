@@ -24,9 +24,9 @@ retarded, log-normal spectrum, of the actuation |
 each tendon | Ellis' fluid |
 | `contact` | a rough round post beside the arm: MuJoCo's contact | one key point and a plane |
 | `softening` | parts of each joint fail at bendings of Weibull's (1939) distribution | \
-exponential in energy |
+exponential or inverse root in energy |
 | `coupling` | the frame of the motors yields: the tension of a tendon slackens its neighbours | \
-polynomial of loads |
+polynomial of loads; of their difference |
 | `dead_zone` | tendons that sag: a parabola of the stretch, then a line | smoothed by a root |
 | `drift` | base that turns by a hyperbola of time | saturating exponential |
 | `stiffening` | a sleeve that is taut from a bending of each joint on: a corner | exponential \

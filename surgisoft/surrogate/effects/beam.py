@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from scipy.interpolate import make_interp_spline
-from torch import Tensor
+from torch import Tensor, nn
 
 CUTS = 4
 """Intervals of the centreline between two key points."""
@@ -92,6 +92,31 @@ class Beam:
             float(knots[-1]),
             _shares(knots)[below:],
         )
+
+
+class Sagging(nn.Module):
+    """Displacement of key points by the own weight of a body that sags by 1 mm at its tip when it
+    is held straight and level."""
+
+    down: Tensor
+    lever: Tensor
+    chords: Tensor
+    collect: Tensor
+
+    def __init__(self, rest_mm: Tensor, gravity: tuple[float, float, float]):
+        """rest_mm: (n, 3) key points at rest, mm; gravity: unit vector; base frame."""
+        super().__init__()
+        beam = Beam.through(rest_mm)
+        self.length_mm = beam.length_mm
+        lever = beam.weights * (8 / beam.length_mm**4)
+        for name, value in (("lever", lever), ("chords", beam.chords), ("collect", beam.collect)):
+            self.register_buffer(name, value, persistent=False)
+        self.register_buffer("down", torch.tensor(gravity).float().unsqueeze(-1), persistent=False)
+
+    def forward(self, points: Tensor) -> Tensor:
+        """(..., n, 3) displacement, mm, of key points (..., n, 3), mm."""
+        p = points.mT.contiguous()
+        return displaced(cross(p @ self.lever, self.down), p @ self.chords, self.collect)
 
 
 def _shares(knots: np.ndarray) -> tuple[float, ...]:

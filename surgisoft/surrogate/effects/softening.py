@@ -1,7 +1,8 @@
-"""Softening effect: the wall is softer below the largest load that it has carried (Mullins 1969).
+"""Softening effect: the wall is softer once it has carried a load (Mullins 1969).
 
-The form is that of pseudo-elasticity (Ogden & Roxburgh 1999), with the energy W ~ u^2 of a wall
-fibre's load, its largest value so far W_max, and an exponential instead of the error function:
+*Below the largest load only.* The form is that of pseudo-elasticity (Ogden & Roxburgh 1999), with
+the energy W ~ u^2 of a wall fibre's load, its largest value so far W_max, and an exponential
+instead of the error function:
 
     x_eff = x + own A' (u d(W, W_max)) / |A| + common x d(V, V_max),   u = A x / |A|,
     d(W, W_max) = 1 - exp(-(W_max - W) / (width + growth W_max)),
@@ -10,38 +11,70 @@ fibre's load, its largest value so far W_max, and an exponential instead of the 
 A mixes the chambers' loads into those of wall fibres (`fibre_matrix`): a chamber that bends the arm
 shortens the wall on the other side. On a first loading W = W_max and nothing changes.
 
-In a symmetric section bending and stretch are apart (`stiffening`): with b the bending, e the
-stretch by the loads (`bend_and_stretch`) and their energies B^2 and e^2,
+*Damage* (Kachanov 1958; Simo 1987) depends on the largest energy alone: the wall is softer at that
+load, too. In the place of d stands a function that rises from 0 to 1,
+
+    r(W_max) = 1 - (1 + W_max / width)^(-1/2).
+
+*Of the section.* In a symmetric section bending and stretch are apart (`stiffening`): with b the
+bending, e the stretch by the loads (`bend_and_stretch`) and their energies B^2 and e^2,
 
     x_eff = x + own b d(B^2, B^2_max) + common e d(e^2, e^2_max).
+
+*Of the body.* A softer wall gives way to all that bends it, weight included, and not to the
+chambers alone. So each node of the body bends and stretches more (`bent_body`), by its own largest
+strain: with b_k the bending at the node k beyond that at rest, e_k the stretch, and u(p) the sag of
+the body by its own weight (`payload`) where gravity is known,
+
+    b_k -> b_k (1 + own d_k),    e_k -> e_k (1 + common d_k),    q = p + sag mean_k d_k u(p).
+
+d_k is r(W_max), or r(W_max) - r(W) below the largest strain only; W is the square of b_k and that
+of e_k, each for itself, or the sum of both, in rad^2 over the whole length.
 """
 
 import torch
 from torch import Tensor, nn
 
+from surgisoft.errors import unknown_name
 from surgisoft.surrogate.effects.base import (
     ArmFacts,
     Context,
     Effect,
     Quantity,
+    Stage,
     amplitude,
     logarithm,
     value_of,
 )
-from surgisoft.surrogate.effects.hypothesis import Hypothesis
+from surgisoft.surrogate.effects.beam import Sagging
+from surgisoft.surrogate.effects.bent_body import BentBody
+from surgisoft.surrogate.effects.hypothesis import Hypothesis, no_combinations
 from surgisoft.surrogate.effects.readings import Reading
 from surgisoft.surrogate.effects.wall_fibres import WallFibres, bend_and_stretch, walls_tried
 
 GRID = ((0.05, 0.02), (0.2, 0.02), (0.8, 0.02), (0.02, 0.2), (0.02, 0.7))
 """Widths that identification tries, in units of the energy at full load, and their growths."""
+DAMAGE_GRID = (0.1, 1.0)
+"""Widths of damage that identification tries, in units of the energy at full load."""
+BODY_GRID = ((0.05, True), (1.0, True), (0.01, False), (0.1, False))
+"""Widths that identification tries of the body, in units of the energy at HARD, and whether the
+wall is damaged: a softening below the largest strain is over within a small part of it."""
+HARD = 0.98
+"""Quantile over the recordings of the mean energy of the nodes."""
+ENERGIES = ("apart", "whole")
+"""Energies of the body: that of bending and that of stretch, or their sum."""
 OTHERS = -0.35
 """Share of the other chambers in a wall fibre's load that identification tries."""
 
 
 class Softening(WallFibres):
-    """Mullins softening by the largest load of a chamber and of all of them."""
+    """Softening by the largest load of a chamber and of all of them, or by the largest strain."""
 
-    stage = "material"
+    bent: BentBody
+    sagging: Sagging
+    log_growth: nn.Parameter
+    """Logarithm of the growth; None with damage and of the body."""
+    stage: Stage = "material"
 
     def __init__(
         self,
@@ -51,32 +84,59 @@ class Softening(WallFibres):
         others: float = 0.0,
         ring: bool = False,
         section: bool = False,
+        damage: bool = False,
+        body: str | None = None,
+        weight: bool = False,
     ):
         """Choose the range of energy over which the wall softens, and the fibres.
 
-        width: drop of the energy over which the wall softens, in units of the energy at full load;
-        growth: share of the largest energy that is added to the width; others, ring: the mixture of
-        the wall fibres' loads (`fibre_matrix`); section: bending and stretch in their place.
+        width: energy over which the wall softens, in units of that at full load, of the body in
+        rad^2; growth: share of the largest energy that is added to the width; others, ring: the
+        mixture of the wall fibres' loads (`fibre_matrix`); section: bending and stretch in their
+        place; damage: whether the wall is softer at the largest load, too; body: one of ENERGIES,
+        for the strains of the body in place of loads; weight: whether the softer body also sags by
+        its own weight, whose direction must then be known.
         """
         super().__init__(facts)
+        if body is not None and body not in ENERGIES:
+            raise unknown_name("energy of the body", body, ENERGIES)
+        self.damage, self.body, self.weight = bool(damage), body, bool(weight)
         self.own = amplitude(1)
         self.common = amplitude(1)
         self.log_width = logarithm(width)
-        self.log_growth = logarithm(growth)
-        self.set_fibres(others, ring, section)
+        spread = None if damage or body else logarithm(growth)
+        self.register_parameter("log_growth", spread)
+        self.set_fibres(others, ring, section or body is not None)
+        if body is not None:
+            self.stage = "body"
+            self.bent = BentBody(facts.rest_mm)
+        if weight:
+            assert facts.gravity is not None, "a sag by weight needs the direction of gravity"
+            self.sag = amplitude(1)
+            self.sagging = Sagging(facts.rest_mm, facts.gravity)
 
     def amplitudes(self) -> dict[str, nn.Parameter]:
-        """`own` (1,) by each fibre's load and `common` (1,) by all chambers' loads; of a section by
-        its bending and its stretch."""
-        return {"own": self.own, "common": self.common}
+        """`own` (1,) by each fibre's load and `common` (1,) by all chambers' loads; of a section
+        or the body by its bending and its stretch; `sag` (1,) of the body by its weight, mm."""
+        given = {"own": self.own, "common": self.common}
+        return {**given, "sag": self.sag} if self.weight else given
 
     def memory_parameters(self) -> list[nn.Parameter]:
         """The fibres' mixture."""
-        return [] if self.section else [self.others]
+        return [] if self.others is None else [self.others]
 
     def energy(self, signal: Tensor) -> Tensor:
-        """(..., K + 1) energy of each fibre and the chambers' mean, from actuation (..., m); of a
-        section (..., 2) that of its bending and that of its stretch."""
+        """Energies that the wall remembers.
+
+        (..., K + 1) of each fibre and the chambers' mean, from actuation (..., m); of a section
+        (..., 2) that of its bending and that of its stretch; of the body (..., K, 2) the same of
+        its nodes, from key points (..., n, 3), mm.
+        """
+        if self.body is not None:
+            energies = self.bent.energies(signal)
+            if self.body == "apart":
+                return energies
+            return energies.sum(-1, keepdim=True).expand_as(energies)
         load = self.load(signal)
         if self.section:
             _, size, stretch = bend_and_stretch(load)
@@ -85,45 +145,70 @@ class Softening(WallFibres):
         return torch.cat([own, mean], dim=-1)
 
     def rest(self, signal: Tensor) -> Tensor:
-        """(B, K + 1) largest energies of an arm that has only seen the actuation (B, m)."""
+        """(B, ...) largest energies of an arm that has only seen the signal (B, ...)."""
         return self.energy(signal)
 
     def advance(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
-        """(B, K + 1) largest energies after the actuation (B, m)."""
+        """(B, ...) largest energies after the signal (B, ...)."""
         return torch.maximum(memory, self.energy(signal))
 
     def scan(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
-        """(R, T, K + 1) largest energies along the actuation (R, T, m)."""
+        """(R, T, ...) largest energies along the signal (R, T, ...)."""
         return torch.maximum(self.energy(signal).cummax(dim=1).values, memory.unsqueeze(1))
 
-    def _softened(self, signal: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Two (..., m) shifts of the actuation at amplitude one: `own` and `common`."""
+    def lost(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """Share of the stiffness that is lost at amplitude one, in the shape of the memory."""
+        width = self.log_width.exp()
+
+        def damaged(energy: Tensor) -> Tensor:
+            return 1 - (1 + energy / width).rsqrt()
+
+        if self.damage:
+            return damaged(memory)
+        if self.body is not None:
+            return damaged(memory) - damaged(self.energy(signal))
         below = (memory - self.energy(signal)).clamp(min=0)
-        damage = -torch.expm1(-below / (self.log_width.exp() + self.log_growth.exp() * memory))
+        return -torch.expm1(-below / (width + self.log_growth.exp() * memory))
+
+    def _softened(self, signal: Tensor, memory: Tensor) -> tuple[Tensor, ...]:
+        """Changes of the signal, in its shape, at each amplitude of one."""
+        lost = self.lost(signal, memory)
+        if self.body is not None:
+            bent = self.bent.moved(signal, lost)
+            if not self.weight:
+                return bent
+            return *bent, self.sagging(signal) * lost[..., 0].mean(-1)[..., None, None]
         load = self.load(signal)
         if self.section:
             bend, _, stretch = bend_and_stretch(load)
-            common = (stretch * damage[..., -1:]).expand_as(load)
-            return self.reach * bend * damage[..., :-1], self.reach * common
+            common = (stretch * lost[..., -1:]).expand_as(load)
+            return self.reach * bend * lost[..., :-1], self.reach * common
         fibres = self.fibres
-        own = ((load @ fibres.T) * damage[..., :-1]) @ fibres
-        return self.reach * own, self.reach * load * damage[..., -1:]
+        own = ((load @ fibres.T) * lost[..., :-1]) @ fibres
+        return self.reach * own, self.reach * load * lost[..., -1:]
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
-        """Effective actuation (..., m) from actuation (..., m) and largest energies."""
-        own, common = self._softened(signal, memory)
-        return signal + self.own * own + self.common * common
+        """Signal behind the effect, in its shape, from largest energies (..., ...)."""
+        changes = self._softened(signal, memory)
+        for size, change in zip(self.amplitudes().values(), changes, strict=True):
+            signal = signal + size * change
+        return signal
 
     def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
-        """(2, ..., m) change of the actuation by each amplitude: closed form."""
-        return torch.stack(self._softened(signal, memory)).detach()
+        """(2, ...), with a weight (3, ...), change of the signal by each amplitude: closed form."""
+        with torch.no_grad():
+            return torch.stack(self._softened(signal, memory))
 
     def config(self) -> dict:
-        """Whether the fibres stand in a ring, or bending and stretch are in their place."""
-        return {**super().config(), "section": self.section}
+        """The fibres or what stands in their place, and whether the wall is damaged."""
+        section = self.section and self.body is None
+        own = {"section": section, "damage": self.damage, "body": self.body, "weight": self.weight}
+        return {**super().config(), **own}
 
     def quantities(self) -> list[Quantity]:
-        """Shares of push that softening adds, its energy range and the fibres' mixture."""
+        """Shares of push or strain that softening adds, its energy range, the fibres' mixture."""
+        if self.body is not None:
+            return self._of_body()
         rubber = "wide: at most twice the push; a wall does not heal by load (Mullins 1969)"
         total = float((self.own + self.common).detach())
         own, common = ("bend", "stretch") if self.section else ("own", "common")
@@ -132,12 +217,43 @@ class Softening(WallFibres):
             Quantity(f"{common}_share", value_of(self.common), "", -0.5, 1.0, rubber),
             Quantity("total_share", total, "", 0.0, 1.0, rubber),
             Quantity("width_share", value_of(self.log_width.exp()), "", 0.001, 5.0, rubber),
-            Quantity("growth_share", value_of(self.log_growth.exp()), "", 1e-4, 5.0, rubber),
         ]
+        if not self.damage:
+            growth = value_of(self.log_growth.exp())
+            quantities.append(Quantity("growth_share", growth, "", 1e-4, 5.0, rubber))
         return [*quantities, *self.mixture()]
 
+    def _of_body(self) -> list[Quantity]:
+        """Quantities of a body that softens."""
+        wall = "wide: at most three quarters of the stiffness; a wall does not heal by load"
+        angle = value_of((0.5 * self.log_width).exp())
+        quantities = [
+            Quantity("bend_share", value_of(self.own), "", 0.0, 3.0, wall),
+            Quantity("stretch_share", value_of(self.common), "", -0.1, 3.0, wall),
+            Quantity(
+                "width_rad", angle, "rad", 1e-3, 20.0, "less than the recordings show to more"
+            ),
+        ]
+        if self.weight:
+            most = 0.5 * self.sagging.length_mm
+            source = "weight pulls down; to first order, so below half the length"
+            quantities.append(Quantity("sag_mm", value_of(self.sag), "mm", 0.0, most, source))
+        return quantities
+
     def readings(self, seconds: float | None = None) -> list[Reading]:
-        """Change of a chamber's push at half load after a full load, %."""
+        """Change of a chamber's push at half load after a full load, %; of the body the largest
+        loss of stiffness in bending and in stretch, %."""
+        if self.body is not None:
+            own, common = (100 * float(each.detach()) for each in (self.own, self.common))
+            where = "where it was {} most, the body {} more by up to {{}}"
+            readings = [
+                Reading(where.format("bent", "bends"), own, "%", own),
+                Reading(where.format("stretched", "stretches"), common, "%", common),
+            ]
+            if self.weight:
+                text = "a body that is as soft everywhere, held straight and level, sags by {} more"
+                readings.append(Reading(text, float(self.sag.detach()), "mm"))
+            return readings
         with torch.no_grad():
             full = torch.diag(self.reach)
             half = self.origin + 0.5 * full
@@ -149,7 +265,30 @@ class Softening(WallFibres):
 
 def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
     walls = walls_tried(len(facts.low), OTHERS)
-    return [Softening(facts, width, growth, *one) for width, growth in GRID for one in walls]
+    below = [Softening(facts, width, growth, *one) for width, growth in GRID for one in walls]
+    damage = [
+        Softening(facts, width, 0.0, *one, damage=True) for width in DAMAGE_GRID for one in walls
+    ]
+    return [*below, *damage, *_of_body(facts, points)]
 
 
-HYPOTHESIS = Hypothesis(Softening, _grid)
+def _of_body(facts: ArmFacts, points: Tensor) -> list[Effect]:
+    """Softening by the strains of the body; none of a body at rest."""
+    points = points[torch.isfinite(points).all(-1).all(-1)]
+    if len(points) < 2:
+        return []
+    made: list[Effect] = []
+    for body in ENERGIES:
+        strained = Softening(facts, body=body).energy(points)[..., 0].mean(-1)
+        hard = float(strained.quantile(HARD))
+        if not hard > 0.0:
+            continue
+        made += [
+            Softening(facts, width * hard, damage=damage, body=body, weight=weight)
+            for width, damage in BODY_GRID
+            for weight in ((False, True) if facts.gravity is not None else (False,))
+        ]
+    return made
+
+
+HYPOTHESIS = Hypothesis(Softening, _grid, combinations=no_combinations)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from surgisoft.errors import InputError
-from surgisoft.surrogate.effects.base import Effect, Quantity, value_of
+from surgisoft.surrogate.effects.base import Effect, Quantity, Stage, value_of
 
 RINGS = (3, 4)
 """Numbers of chambers that are assumed to stand in one ring; of other numbers nothing is known."""
@@ -21,7 +21,7 @@ RINGS = (3, 4)
 class WallFibres(Effect, ABC):
     """An effect on the loads of wall fibres; a subclass calls `set_fibres` when it is built."""
 
-    stage = "material"
+    stage: Stage = "material"
     version = 2
     """Version 1 had one fibre along each chamber; 2 also has a ring of fibres and redefines
     `others`."""

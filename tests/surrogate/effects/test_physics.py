@@ -16,6 +16,7 @@ from surgisoft.surrogate.effects import (
     known_effects,
     make_effect,
 )
+from surgisoft.surrogate.effects.coupling import beside
 
 RANGE = ArmFacts(torch.zeros(3), torch.full((3,), 50.0), torch.zeros(3), torch.zeros(5, 3))
 STRAIGHT = torch.tensor([[0.0, 0.0, 10.0 * k] for k in range(9)])
@@ -304,6 +305,35 @@ def test_a_neighbour_takes_a_share_of_what_a_chamber_pushes():
         coupled = with_strength(make_effect("coupling", RANGE, who=who), product=0.2)
         answer = run(coupled, [[0.5, 1.0, 0.4]])[0].tolist()
         assert answer == pytest.approx([0.5 - expected[0], 1.0 - expected[1], 0.4 - expected[2]])
+
+
+def test_walls_between_chambers_yield_to_the_difference_of_loads():
+    """A fifth of the own load times the differences to its neighbours, or their roots."""
+    plate = with_strength(make_effect("coupling", RANGE, who="beside"), yielded=0.2)
+    lost = [0.2 * 0.5 * (0.5 - 0.5), 0.2 * 1.0 * (-0.5 - 1.0), 0.0]
+    answer = run(plate, [[0.5, 1.0, 0.0]])[0].tolist()
+    assert answer == pytest.approx([0.5 - lost[0], 1.0 - lost[1], 0.0], abs=1e-6)
+    slack = with_strength(make_effect("coupling", RANGE, who="beside", power=0.5), yielded=0.2)
+    root, unit = 0.5 / (0.25 + 0.05**2) ** 0.25, 1.0 / (1.0 + 0.05**2) ** 0.25
+    answer = run(slack, [[0.5, 1.0, 0.0]])[0].tolist()
+    assert answer == pytest.approx([0.5, 1.0 + 0.2 * (root + unit), 0.0], abs=1e-5)
+
+
+def test_chambers_beside_each_other_are_neighbours_in_the_ring_of_a_segment():
+    three, four, six = (beside(m).int().tolist() for m in (3, 4, 6))
+    assert three == [[0, 1, 1], [1, 0, 1], [1, 1, 0]]
+    assert four == [[0, 1, 0, 1], [1, 0, 1, 0], [0, 1, 0, 1], [1, 0, 1, 0]]
+    nothing = [0, 0, 0]
+    assert six == [*(row + nothing for row in three), *(nothing + row for row in three)]
+    assert beside(2).tolist() == [[0, 1], [1, 0]]
+
+
+def test_damage_is_there_at_the_largest_load_too():
+    """Half of the loss at an energy of three widths: 1 - (1 + 3)^(-1/2)."""
+    soft = make_effect("softening", RANGE, width=1 / 3, damage=True)
+    soft = with_strength(soft, own=0.2)
+    answer = run(soft, [0.0, 1.0, 0.5])[:, 0].tolist()
+    assert answer == pytest.approx([0.0, 1.1, 0.55])
 
 
 def test_play_loop_has_its_area():

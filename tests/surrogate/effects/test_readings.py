@@ -80,6 +80,32 @@ def test_a_coupling_says_which_chamber_loses_to_which(config):
         assert value == pytest.approx(100 * float(lost.detach()), abs=1e-3)
 
 
+@pytest.mark.parametrize("power", [1.0, 0.5])
+def test_a_wall_that_yields_says_what_a_chamber_at_half_load_loses(power):
+    """By the effect itself: chamber 1 at half load beside chamber 2 at full load."""
+    effect = stir(make_effect("coupling", FACTS, who="beside", power=power), seed=1)
+    two = replace(FACTS, low=FACTS.low[:2], high=FACTS.high[:2], rest=FACTS.rest[:2])
+    pair = make_effect("coupling", two, who="beside", power=power)
+    pair.load_state_dict(effect.state_dict())
+    pushed = pair.apply(torch.tensor([[0.5, 1.0]]) * two.high, NONE)[0, 0]
+    lost = 1 - float(pushed.detach()) / (0.5 * float(two.high[0]))
+    (said,) = values(effect).items()
+    assert said == (
+        "a chamber at half load loses {} of its push to a fully loaded one beside it",
+        pytest.approx(100 * lost, abs=1e-3),
+    )
+
+
+def test_a_body_that_softens_says_how_much_more_it_bends_stretches_and_sags():
+    soft = make_effect("softening", FACTS, width=0.5, body="whole", weight=True)
+    words = in_words(with_amplitudes(soft, own=0.2, common=0.1, sag=3.0).readings())
+    assert words == (
+        "where it was bent most, the body bends more by up to 20 %, "
+        "where it was stretched most, the body stretches more by up to 10 %, "
+        "a body that is as soft everywhere, held straight and level, sags by 3 mm more"
+    )
+
+
 def test_of_many_couplings_the_six_largest_are_told():
     """Six chambers have 30 of them: the largest first, and how many more there are."""
     six = replace(FACTS, low=torch.zeros(6), high=torch.full((6,), 100.0), rest=torch.zeros(6))

@@ -1,0 +1,102 @@
+"""Bending and stretch of a body through its key points, from segment to segment.
+
+The nodes of a body are its clamp and its key points, straight lines join them. At each node the
+body bends by the rotation vector that turns the direction of the line before it into that of the
+line behind it; the line before the first node has the direction that the first line has at rest.
+Each line stretches against its length at rest. All of it follows from measured key points and holds
+for any cause of the bending, weight included.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from surgisoft.surrogate.effects.beam import BASE_SHARE
+
+SLENDERNESS = 10.0
+"""Length over radius of an arm: a wall that is stretched by 1 / SLENDERNESS is strained as one that
+is bent by 1 rad over the length [-]."""
+TINY = 1e-6
+"""Length, mm, and sine of an angle below which a direction is not divided by them."""
+
+
+class BentBody(nn.Module):
+    """The nodes of an arm and what they bend and stretch."""
+
+    lengths: Tensor
+    clamp: Tensor
+    rest_bend: Tensor
+    rest_stretch: Tensor
+
+    def __init__(self, rest_mm: Tensor):
+        """rest_mm: (n, 3) key points at rest, mm, base frame.
+
+        Where the lowest key point is not at the base, the clamp is at the frame's origin. A rest
+        shape that is not known (zeros) counts as evenly spaced points of 1 mm.
+        """
+        super().__init__()
+        rest = rest_mm.detach().float()
+        steps = (rest[1:] - rest[:-1]).norm(dim=1)
+        if not rest.any() or not bool((steps > 0).all()):
+            rest = torch.arange(1.0, len(rest) + 1)[:, None] * torch.tensor([0.0, 0.0, 1.0])
+            steps = (rest[1:] - rest[:-1]).norm(dim=1)
+        self.below = len(rest) == 1 or float(rest[0].norm()) > BASE_SHARE * float(steps.sum())
+        lines = self._lines(rest)
+        lengths = lines.norm(dim=1)
+        self.register_buffer("lengths", lengths, persistent=False)
+        self.register_buffer("clamp", lines[0] / lengths[0], persistent=False)
+        bend, stretch = self.strains(rest)
+        self.register_buffer("rest_bend", bend, persistent=False)
+        self.register_buffer("rest_stretch", stretch, persistent=False)
+
+    def _lines(self, points: Tensor) -> Tensor:
+        """(..., K, 3) lines between the nodes, mm, of key points (..., n, 3)."""
+        lines = points[..., 1:, :] - points[..., :-1, :]
+        return torch.cat([points[..., :1, :], lines], dim=-2) if self.below else lines
+
+    def strains(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """(bending (..., K, 3), stretch (..., K)) at K nodes of key points (..., n, 3), mm.
+
+        The bending is a rotation vector, rad, the stretch a change of length over the length.
+        """
+        lines = self._lines(points)
+        lengths = lines.norm(dim=-1)
+        along = lines / lengths.clamp(min=TINY).unsqueeze(-1)
+        first = self.clamp.expand_as(along[..., :1, :])
+        before = torch.cat([first, along[..., :-1, :]], dim=-2)
+        turned = torch.linalg.cross(before, along, dim=-1)
+        sine, cosine = turned.norm(dim=-1), (before * along).sum(-1)
+        angle = torch.atan2(sine, cosine) / sine.clamp(min=TINY)
+        return turned * angle.unsqueeze(-1), lengths / self.lengths - 1.0
+
+    def _beyond_rest(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """(bending (..., K, 3), stretch (..., K)) less those of the shape at rest."""
+        bend, stretch = self.strains(points)
+        return bend - self.rest_bend, stretch - self.rest_stretch
+
+    def energies(self, points: Tensor) -> Tensor:
+        """(..., K, 2) squares of the bending and of the stretch beyond those at rest, rad^2.
+
+        points: (..., n, 3) key points, mm. A node bends as much as the whole arm would with the
+        curvature there; a stretch of 1 / SLENDERNESS counts as a bending of 1 rad.
+        """
+        bend, stretch = self._beyond_rest(points)
+        whole = (self.lengths.sum() / self.lengths).square()
+        return torch.stack(
+            [bend.square().sum(-1) * whole, (SLENDERNESS * stretch).square()], dim=-1
+        )
+
+    def moved(self, points: Tensor, more: Tensor) -> tuple[Tensor, Tensor]:
+        """Two displacements (..., n, 3), mm: shares `more` (..., K, 2) of bending and of stretch
+        beyond those at rest.
+
+        To first order: what bends at a node turns everything beyond it.
+        """
+        bend, stretch = self._beyond_rest(points)
+        lines = self._lines(points)
+        turned = (bend * more[..., :1]).cumsum(dim=-2)
+        by_bend = torch.linalg.cross(turned, lines, dim=-1).cumsum(dim=-2)
+        by_stretch = (lines * (stretch * more[..., 1]).unsqueeze(-1)).cumsum(dim=-2)
+        if self.below:
+            return by_bend, by_stretch
+        still = torch.zeros_like(points[..., :1, :])
+        return torch.cat([still, by_bend], dim=-2), torch.cat([still, by_stretch], dim=-2)

@@ -1,0 +1,134 @@
+"""Bending and stretch of a body, and a wall that softens by them, against arcs in closed form."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from surgisoft.surrogate.effects import ArmFacts, Context, make_effect
+from surgisoft.surrogate.effects.bent_body import SLENDERNESS, BentBody
+
+NODES = 21
+LENGTH = 100.0
+ALONG = torch.linspace(0.0, 1.0, NODES).double()
+STRAIGHT = torch.stack([0 * ALONG, 0 * ALONG, LENGTH * ALONG], -1)
+
+
+def arc(angle: float, towards: float = 0.0, length: float = LENGTH) -> torch.Tensor:
+    """(NODES, 3) key points on an arc from the base, along z there, that turns by an angle."""
+    turned, radius = angle * ALONG, length / angle
+    out, up = radius * (1 - turned.cos()), radius * turned.sin()
+    return torch.stack([out * math.cos(towards), out * math.sin(towards), up], -1)
+
+
+def facts(rest_mm: torch.Tensor = STRAIGHT, gravity=None) -> ArmFacts:
+    """An arm of three chambers with these key points at rest."""
+    three = torch.zeros(3)
+    return ArmFacts(three, three + 1, three, rest_mm.float(), gravity)
+
+
+def body(rest_mm: torch.Tensor = STRAIGHT) -> BentBody:
+    """The body of an arm with these key points at rest."""
+    return BentBody(rest_mm).double()
+
+
+def along(effect, *shapes: torch.Tensor) -> torch.Tensor:
+    """(T, n, 3) key points behind an effect that sees these shapes one after another."""
+    signal = torch.stack(shapes).unsqueeze(0).double()
+    effect = effect.double()
+    memory = effect.scan(effect.rest(signal[:, 0]), signal, Context(torch.ones(1, len(shapes))))
+    return effect.apply(signal, memory)[0].detach()
+
+
+@given(st.floats(0.1, 2.0), st.floats(-3.0, 3.0), st.floats(0.9, 1.2))
+def test_an_arc_bends_by_its_angle_everywhere_and_stretches_by_its_length(angle, towards, longer):
+    """The rotation vectors add up to the angle, less half a step at the clamp and at the tip."""
+    bend, stretch = body().strains(arc(angle, towards, longer * LENGTH))
+    across = torch.tensor([-math.sin(towards), math.cos(towards), 0.0]).double()
+    whole = angle * (1 - 0.5 / (NODES - 1))
+    assert torch.allclose(bend.sum(0), whole * across, atol=1e-9)
+    chord = longer * math.sin(angle / 40) / (angle / 40) - 1
+    assert torch.allclose(stretch, torch.full_like(stretch, chord), atol=1e-6)
+    energy = body().energies(arc(angle, towards, longer * LENGTH))
+    assert torch.allclose(energy[1:, 0], torch.full((NODES - 2,), angle**2).double(), rtol=1e-5)
+    square = torch.full((NODES - 1,), (SLENDERNESS * chord) ** 2).double()
+    assert torch.allclose(energy[:, 1], square, rtol=1e-4, atol=1e-6)
+
+
+@given(st.floats(0.2, 1.5), st.floats(-3.0, 3.0))
+def test_more_bending_and_more_stretch_lead_to_the_next_arc(angle, towards):
+    """To first order, by the difference of two arcs."""
+    step = 1e-5
+    more = torch.full((NODES - 1, 2), step).double()
+    by_bend, by_stretch = body().moved(arc(angle, towards), more)
+    bent = arc(angle * (1 + step), towards) - arc(angle, towards)
+    # Chords of the next arc are shorter by (angle / 20)^2 / 12 of the step.
+    assert torch.allclose(by_bend, bent, atol=LENGTH * step * 1e-3)
+    assert not by_stretch.abs().max() > LENGTH * step * 1e-3
+    longer = arc(angle, towards, 1.1 * LENGTH)
+    by_stretch = body().moved(longer, more)[1]
+    strain = 1.1 * math.sin(angle / 40) / (angle / 40) - 1
+    assert torch.allclose(by_stretch, longer * strain / (1 + strain) * (1 + strain) * step)
+
+
+def test_only_what_is_beyond_the_shape_at_rest_bends_more():
+    rest = arc(0.8)
+    assert float(body(rest).energies(rest).abs().max()) < 1e-9
+    by_bend, by_stretch = body(rest).moved(rest, torch.ones(NODES - 1, 2).double())
+    assert float(by_bend.abs().max()) < 1e-4
+    assert float(by_stretch.abs().max()) < 1e-4
+
+
+def test_a_first_key_point_above_the_base_hangs_on_a_line_from_the_origin():
+    raised = STRAIGHT[2:]
+    bend, stretch = body(raised).strains(raised)
+    assert bend.shape == (NODES - 2, 3)
+    assert stretch.shape == (NODES - 2,)
+    assert body(raised).moved(raised, torch.ones(NODES - 2, 2).double())[0].shape == raised.shape
+
+
+@pytest.mark.parametrize("energy", ["apart", "whole"])
+def test_damage_stays_at_the_largest_strain_and_below_it_in_the_other_form(energy):
+    """Arcs of 1 rad and then of half of it: r = 1 - (1 + 1 / 0.5)^(-1/2), less that of 1 / 4."""
+    at_one, at_half = (1 - (1 + square / 0.5) ** -0.5 for square in (1.0, 0.25))
+    first, again = arc(1.0), arc(0.5)
+    lost = {True: (at_one, at_one), False: (0.0, at_one - at_half)}
+    for damage, shares in lost.items():
+        soft = make_effect("softening", facts(), width=0.5, damage=damage, body=energy)
+        soft.own.data.fill_(0.01)
+        found = along(soft, STRAIGHT + 1e-9, first, again)
+        for shape, angle, share, points in zip(
+            (first, again), (1.0, 0.5), shares, found[1:], strict=True
+        ):
+            expected = arc(angle * (1 + 0.01 * share)) - shape
+            # At the clamp half as much bends, so the damage there is less.
+            assert torch.allclose(points - shape, expected, atol=0.05 * 0.01 * LENGTH * angle)
+            assert float((points - shape).abs().max()) >= 0.9 * float(expected.abs().max()) - 1e-6
+
+
+def test_a_stretched_wall_is_also_softer_in_bending_where_its_energy_is_the_sum():
+    long, bent = 1.1 * STRAIGHT, arc(0.3)
+    for energy, softer in (("whole", True), ("apart", False)):
+        soft = make_effect("softening", facts(), width=0.1, damage=True, body=energy)
+        soft.own.data.fill_(0.1)
+        before = along(soft, STRAIGHT, bent)[-1]
+        after = along(soft, STRAIGHT, long, bent)[-1]
+        assert bool((after - before).abs().max() > 0.1) == softer
+
+
+def test_a_softer_body_sags_as_one_with_more_weight_does():
+    """At rest after a large bend, by the payload of the body alone."""
+    level = (1.0, 0.0, 0.0)
+    soft = make_effect(
+        "softening", facts(gravity=level), width=0.5, body="whole", weight=True, damage=True
+    )
+    soft.sag.data.fill_(2.0)
+    found = along(soft, STRAIGHT, arc(1.0), STRAIGHT)[-1]
+    damage = 1 - (1 + body().energies(arc(1.0)).sum(-1) / 0.5).rsqrt()
+    load = make_effect("payload", facts(gravity=level))
+    load.body_sag.data.fill_(2.0 * float(damage.mean()))
+    sagged = load.double().apply(STRAIGHT, STRAIGHT.new_zeros(0)).detach()
+    assert torch.allclose(found, sagged, atol=1e-4)
+    assert float(found[-1, 0]) == pytest.approx(2.0 * float(damage.mean()), rel=1e-2)

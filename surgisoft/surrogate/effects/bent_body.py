@@ -15,6 +15,10 @@ from surgisoft.surrogate.effects.beam import BASE_SHARE
 SLENDERNESS = 10.0
 """Length over radius of an arm: a wall that is stretched by 1 / SLENDERNESS is strained as one that
 is bent by 1 rad over the length [-]."""
+ENERGIES = ("apart", "whole")
+"""Energies of a wall: that of bending and that of stretch, or their sum."""
+HARD = 0.98
+"""Quantile over recordings of the mean energy of the nodes at which a body is much strained."""
 TINY = 1e-6
 """Length, mm, and sine of an angle below which a direction is not divided by them."""
 
@@ -85,6 +89,11 @@ class BentBody(nn.Module):
             [bend.square().sum(-1) * whole, (SLENDERNESS * stretch).square()], dim=-1
         )
 
+    def strained(self, points: Tensor, energies: str) -> Tensor:
+        """(..., K, 2) energy that bending and stretch depend on, rad^2, one of ENERGIES."""
+        found = self.energies(points)
+        return found if energies == "apart" else found.sum(-1, keepdim=True).expand_as(found)
+
     def moved(self, points: Tensor, more: Tensor) -> tuple[Tensor, Tensor]:
         """Two displacements (..., n, 3), mm: shares `more` (..., K, 2) of bending and of stretch
         beyond those at rest.
@@ -95,8 +104,25 @@ class BentBody(nn.Module):
         lines = self._lines(points)
         turned = (bend * more[..., :1]).cumsum(dim=-2)
         by_bend = torch.linalg.cross(turned, lines, dim=-1).cumsum(dim=-2)
-        by_stretch = (lines * (stretch * more[..., 1]).unsqueeze(-1)).cumsum(dim=-2)
+        along = lines / lines.norm(dim=-1, keepdim=True).clamp(min=TINY)
+        longer = self.lengths * stretch * more[..., 1]
+        by_stretch = (along * longer.unsqueeze(-1)).cumsum(dim=-2)
         if self.below:
             return by_bend, by_stretch
         still = torch.zeros_like(points[..., :1, :])
         return torch.cat([still, by_bend], dim=-2), torch.cat([still, by_stretch], dim=-2)
+
+
+def most_strained(rest_mm: Tensor, points: Tensor) -> list[tuple[str, float]]:
+    """For each of ENERGIES that of a body that is much strained, rad^2; none of a body at rest.
+
+    rest_mm: (n, 3) key points at rest, mm; points: (S, n, 3) those of recordings, mm, NaN where
+    missing.
+    """
+    points = points[torch.isfinite(points).all(-1).all(-1)]
+    if len(points) < 2:
+        return []
+    body = BentBody(rest_mm)
+    mean = {each: body.strained(points, each)[..., 0].mean(-1) for each in ENERGIES}
+    hard = {each: float(energy.quantile(HARD)) for each, energy in mean.items()}
+    return [(each, energy) for each, energy in hard.items() if energy > 0.0]

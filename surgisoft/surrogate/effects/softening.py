@@ -47,7 +47,7 @@ from surgisoft.surrogate.effects.base import (
     value_of,
 )
 from surgisoft.surrogate.effects.beam import Sagging
-from surgisoft.surrogate.effects.bent_body import BentBody
+from surgisoft.surrogate.effects.bent_body import ENERGIES, BentBody, most_strained
 from surgisoft.surrogate.effects.hypothesis import Hypothesis, no_combinations
 from surgisoft.surrogate.effects.readings import Reading
 from surgisoft.surrogate.effects.wall_fibres import WallFibres, bend_and_stretch, walls_tried
@@ -57,12 +57,9 @@ GRID = ((0.05, 0.02), (0.2, 0.02), (0.8, 0.02), (0.02, 0.2), (0.02, 0.7))
 DAMAGE_GRID = (0.1, 1.0)
 """Widths of damage that identification tries, in units of the energy at full load."""
 BODY_GRID = ((0.05, True), (1.0, True), (0.01, False), (0.1, False))
-"""Widths that identification tries of the body, in units of the energy at HARD, and whether the
+"""Widths that identification tries of the body, in units of that of a body that is
+much strained, and whether the
 wall is damaged: a softening below the largest strain is over within a small part of it."""
-HARD = 0.98
-"""Quantile over the recordings of the mean energy of the nodes."""
-ENERGIES = ("apart", "whole")
-"""Energies of the body: that of bending and that of stretch, or their sum."""
 OTHERS = -0.35
 """Share of the other chambers in a wall fibre's load that identification tries."""
 
@@ -133,10 +130,7 @@ class Softening(WallFibres):
         its nodes, from key points (..., n, 3), mm.
         """
         if self.body is not None:
-            energies = self.bent.energies(signal)
-            if self.body == "apart":
-                return energies
-            return energies.sum(-1, keepdim=True).expand_as(energies)
+            return self.bent.strained(signal, self.body)
         load = self.load(signal)
         if self.section:
             _, size, stretch = bend_and_stretch(load)
@@ -274,21 +268,12 @@ def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
 
 def _of_body(facts: ArmFacts, points: Tensor) -> list[Effect]:
     """Softening by the strains of the body; none of a body at rest."""
-    points = points[torch.isfinite(points).all(-1).all(-1)]
-    if len(points) < 2:
-        return []
-    made: list[Effect] = []
-    for body in ENERGIES:
-        strained = Softening(facts, body=body).energy(points)[..., 0].mean(-1)
-        hard = float(strained.quantile(HARD))
-        if not hard > 0.0:
-            continue
-        made += [
-            Softening(facts, width * hard, damage=damage, body=body, weight=weight)
-            for width, damage in BODY_GRID
-            for weight in ((False, True) if facts.gravity is not None else (False,))
-        ]
-    return made
+    return [
+        Softening(facts, width * hard, damage=damage, body=body, weight=weight)
+        for body, hard in most_strained(facts.rest_mm, points)
+        for width, damage in BODY_GRID
+        for weight in ((False, True) if facts.gravity is not None else (False,))
+    ]
 
 
 HYPOTHESIS = Hypothesis(Softening, _grid, combinations=no_combinations)

@@ -17,34 +17,58 @@ moment-curvature law of a nonlinear beam, Antman 2005, ch. 4): with b the bendin
 by the loads (`bend_and_stretch`),
 
     x_eff = x - own e h(e^2) - bend b h(B^2).
+
+*Of the body.* A stiffer wall resists all that bends it, weight included, and not the chambers
+alone. So each node of the body bends and stretches less (`bent_body`), by its own strain: with b_k
+the bending at the node k beyond that at rest, e_k the stretch, W the square of b_k and that of e_k,
+each for itself, or the sum of both, and u(p) the sag of the body by its own weight (`payload`)
+where gravity is known,
+
+    b_k -> b_k (1 - bend h(W / full)),    e_k -> e_k (1 - own h(W / full)),
+    q = p - sag mean_k h(W / full) u(p).
+
+`full` is an energy at which the arm is much strained, so that amplitudes are losses there.
 """
+
+import math
 
 import torch
 from torch import Tensor, nn
 
+from surgisoft.errors import unknown_name
 from surgisoft.surrogate.effects.base import (
     ArmFacts,
     Effect,
     Memoryless,
     Quantity,
+    Stage,
     amplitude,
     logarithm,
     value_of,
 )
-from surgisoft.surrogate.effects.hypothesis import Hypothesis
+from surgisoft.surrogate.effects.beam import Sagging
+from surgisoft.surrogate.effects.bent_body import ENERGIES, BentBody, most_strained
+from surgisoft.surrogate.effects.hypothesis import Hypothesis, no_combinations
 from surgisoft.surrogate.effects.readings import Reading
 from surgisoft.surrogate.effects.wall_fibres import WallFibres, bend_and_stretch, walls_tried
 
 GRID = (0.1, 2.0, 5.0)
 """Steepnesses k that identification tries: nearly cubic, and exponential."""
+BODY_GRID = (0.1, 3.0)
+"""Steepnesses that identification tries of the body."""
+MOST = 4.0
+"""Energy, in units of that of the exponential, up to which it grows [-]: a recording beyond the
+fitted range must not blow up."""
 OTHERS = -0.35
 """Share of the other chambers in a wall fibre's load that identification tries."""
 
 
 class Stiffening(WallFibres, Memoryless):
-    """Progressive loss of push, equal for all chambers."""
+    """Progressive loss of push, equal for all chambers, or of strain along the body."""
 
-    stage = "material"
+    bent: BentBody
+    sagging: Sagging
+    stage: Stage = "material"
 
     def __init__(
         self,
@@ -53,30 +77,59 @@ class Stiffening(WallFibres, Memoryless):
         others: float = 0.0,
         ring: bool = False,
         section: bool = False,
+        body: str | None = None,
+        full: float = 1.0,
+        weight: bool = False,
     ):
         """steepness: k of the exponential; towards 0 a cubic spring.
 
         others, ring: the mixture of the wall fibres' loads (`fibre_matrix`); section: bending and
-        stretch of the section in their place.
+        stretch of the section in their place; body: one of ENERGIES, for the strains of the body in
+        place of loads; full: energy of the body at which it loses the shares that the amplitudes
+        say, rad^2; weight: whether the body also sags less by its own weight, whose direction must
+        then be known.
         """
         super().__init__(facts)
+        if body is not None and body not in ENERGIES:
+            raise unknown_name("energy of the body", body, ENERGIES)
+        self.body, self.full, self.weight = body, float(full), bool(weight)
         self.own = amplitude(1)
         self.bend = amplitude(1)
         self.log_steepness = logarithm(steepness)
-        self.set_fibres(others, ring, section)
+        self.set_fibres(others, ring, section or body is not None)
+        if body is not None:
+            self.stage = "body"
+            self.bent = BentBody(facts.rest_mm)
+        if weight:
+            assert facts.gravity is not None, "a sag by weight needs the direction of gravity"
+            self.sag = amplitude(1)
+            self.sagging = Sagging(facts.rest_mm, facts.gravity)
 
     def amplitudes(self) -> dict[str, nn.Parameter]:
-        """`own` (1,) by each fibre's load, or the stretch, and `bend` (1,) by the arm's bending."""
-        return {"own": self.own, "bend": self.bend}
+        """`own` (1,) by each fibre's load, or the stretch, and `bend` (1,) by the arm's bending;
+        `sag` (1,) of the body by its weight, mm."""
+        given = {"own": self.own, "bend": self.bend}
+        return {**given, "sag": self.sag} if self.weight else given
 
-    def _lost(self, signal: Tensor) -> tuple[Tensor, Tensor]:
-        """Two (..., m) shifts of the actuation at amplitude one: `own` and `bend`."""
-        x, k = self.load(signal), self.log_steepness.exp()
+    def _share(self, energy: Tensor) -> Tensor:
+        """Share of the loss at full load, at an energy over that at full load."""
+        k = self.log_steepness.exp()
+        return torch.expm1(k * energy.clamp(max=MOST)) / torch.expm1(k)
+
+    def _lost(self, signal: Tensor) -> tuple[Tensor, ...]:
+        """Changes of the signal, in its shape, at each amplitude of one."""
+        if self.body is not None:
+            less = -self._share(self.bent.strained(signal, self.body) / self.full)
+            by_bend, by_stretch = self.bent.moved(signal, less)
+            if not self.weight:
+                return by_stretch, by_bend
+            sagged = self.sagging(signal) * less[..., 0].mean(-1)[..., None, None]
+            return by_stretch, by_bend, sagged
+        x = self.load(signal)
         bend, size, stretch = bend_and_stretch(x)
 
         def lost(load: Tensor, q: Tensor) -> Tensor:
-            # A recording beyond the fitted range must not blow up.
-            return -load * torch.expm1(k * q.clamp(max=4.0)) / torch.expm1(k)
+            return -load * self._share(q)
 
         if self.section:
             own = lost(stretch, stretch.square()).expand_as(x)
@@ -87,26 +140,32 @@ class Stiffening(WallFibres, Memoryless):
         return self.reach * own, self.reach * lost(x, size)
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
-        """Effective actuation (..., m) from actuation (..., m)."""
-        own, bend = self._lost(signal)
-        return signal + self.own * own + self.bend * bend
+        """The signal behind the effect, in its shape."""
+        changes = self._lost(signal)
+        for size, change in zip(self.amplitudes().values(), changes, strict=True):
+            signal = signal + size * change
+        return signal
 
     def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
-        """(2, ..., m) change of the actuation by each amplitude: closed form."""
-        return torch.stack(self._lost(signal)).detach()
+        """(2, ...), with a weight (3, ...), change of the signal by each amplitude: closed form."""
+        with torch.no_grad():
+            return torch.stack(self._lost(signal))
 
     def config(self) -> dict:
-        """Whether the fibres stand in a ring, or bending and stretch are in their place."""
-        return {**super().config(), "section": self.section}
+        """The fibres, or what stands in their place."""
+        section = self.section and self.body is None
+        body = {"body": self.body, "full": self.full, "weight": self.weight}
+        return {**super().config(), "section": section, **body}
 
     def quantities(self) -> list[Quantity]:
         """Shares of push lost at full load, the steepness and the fibres' mixture."""
         rubber = "wide: a rest of the push is left"
         total = float((self.own + self.bend).detach())
         own = "stretch_share" if self.section else "own_share"
+        less = -0.5 if self.body is None else -0.1
         quantities = [
-            Quantity(own, value_of(self.own), "", -0.5, 0.9, rubber),
-            Quantity("bend_share", value_of(self.bend), "", -0.5, 0.9, rubber),
+            Quantity(own, value_of(self.own), "", less, 0.9, rubber),
+            Quantity("bend_share", value_of(self.bend), "", less, 0.9, rubber),
             Quantity(
                 "total_share",
                 total,
@@ -117,10 +176,30 @@ class Stiffening(WallFibres, Memoryless):
             ),
             Quantity("steepness", value_of(self.log_steepness.exp()), "", 0.005, 12.0, rubber),
         ]
+        if self.weight:
+            most = 0.5 * self.sagging.length_mm
+            source = "to first order, so below half the length; what is stiffer does not sag more"
+            quantities.append(Quantity("sag_mm", value_of(self.sag), "mm", 0.0, most, source))
         return [*quantities, *self.mixture()]
 
     def readings(self, seconds: float | None = None) -> list[Reading]:
-        """Push that is lost at full load, of one chamber alone and of all chambers at once, %."""
+        """Push that is lost at full load, of one chamber alone and of all chambers at once, %; of
+        the body what it bends and stretches less, %, and sags less, mm."""
+        if self.body is not None:
+            bend, own = (100 * float(each.detach()) for each in (self.bend, self.own))
+            angle = math.degrees(math.sqrt(self.full))
+            readings = [
+                Reading(
+                    f"where it bends by {angle:.0f} deg over its length, {{}} less", bend, "%", bend
+                ),
+                Reading("where it stretches as much for its wall, {} less", own, "%", own),
+            ]
+            if self.weight:
+                text = (
+                    "a body that is as stiff everywhere, held straight and level, sags by {} less"
+                )
+                readings.append(Reading(text, float(self.sag.detach()), "mm"))
+            return readings
         with torch.no_grad():
             full = torch.diag(self.reach)
             full = torch.cat([full, self.reach.unsqueeze(0)])
@@ -143,7 +222,18 @@ class Stiffening(WallFibres, Memoryless):
 
 def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
     walls = walls_tried(len(facts.low), OTHERS)
-    return [Stiffening(facts, steepness, *some) for steepness in GRID for some in walls]
+    of_loads = [Stiffening(facts, steepness, *some) for steepness in GRID for some in walls]
+    return [*of_loads, *_of_body(facts, points)]
 
 
-HYPOTHESIS = Hypothesis(Stiffening, _grid)
+def _of_body(facts: ArmFacts, points: Tensor) -> list[Effect]:
+    """Stiffening by the strains of the body; none of a body at rest."""
+    return [
+        Stiffening(facts, steepness, body=body, full=full, weight=weight)
+        for body, full in most_strained(facts.rest_mm, points)
+        for steepness in BODY_GRID
+        for weight in ((False, True) if facts.gravity is not None else (False,))
+    ]
+
+
+HYPOTHESIS = Hypothesis(Stiffening, _grid, combinations=no_combinations)

@@ -7,8 +7,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from surgisoft.errors import InputError
 from surgisoft.surrogate.effects import ArmFacts, Context, make_effect
-from surgisoft.surrogate.effects.bent_body import SLENDERNESS, BentBody
+from surgisoft.surrogate.effects.bent_body import (
+    ENERGIES,
+    SLENDERNESS,
+    BentBody,
+    most_strained,
+)
 
 NODES = 21
 LENGTH = 100.0
@@ -70,7 +76,7 @@ def test_more_bending_and_more_stretch_lead_to_the_next_arc(angle, towards):
     longer = arc(angle, towards, 1.1 * LENGTH)
     by_stretch = body().moved(longer, more)[1]
     strain = 1.1 * math.sin(angle / 40) / (angle / 40) - 1
-    assert torch.allclose(by_stretch, longer * strain / (1 + strain) * (1 + strain) * step)
+    assert torch.allclose(by_stretch, longer * strain / (1 + strain) * step, atol=1e-8)
 
 
 def test_only_what_is_beyond_the_shape_at_rest_bends_more():
@@ -132,3 +138,49 @@ def test_a_softer_body_sags_as_one_with_more_weight_does():
     sagged = load.double().apply(STRAIGHT, STRAIGHT.new_zeros(0)).detach()
     assert torch.allclose(found, sagged, atol=1e-4)
     assert float(found[-1, 0]) == pytest.approx(2.0 * float(damage.mean()), rel=1e-2)
+
+
+@pytest.mark.parametrize("energy", ["apart", "whole"])
+def test_a_body_bends_less_the_more_it_is_bent(energy):
+    """Fung's exponential of 1 / 4 and of 1 of the energy at which the share is lost."""
+    stiff = make_effect("stiffening", facts(), steepness=2.0, body=energy, full=1.0)
+    stiff.bend.data.fill_(0.01)
+    half, full = along(stiff, arc(0.5), arc(1.0))
+    for points, angle in ((half, 0.5), (full, 1.0)):
+        share = math.expm1(2.0 * angle**2) / math.expm1(2.0)
+        expected = arc(angle * (1 - 0.01 * share)) - arc(angle)
+        assert torch.allclose(points - arc(angle), expected, atol=0.06 * 0.01 * LENGTH * angle)
+        assert float((points - arc(angle)).abs().max()) >= 0.9 * float(expected.abs().max())
+
+
+def test_a_stiffer_body_sags_less_and_a_stretched_one_stretches_less():
+    long, level = 1.05 * STRAIGHT, (1.0, 0.0, 0.0)
+    stiff = make_effect(
+        "stiffening", facts(gravity=level), steepness=1e-3, body="whole", full=0.5, weight=True
+    )
+    stiff.sag.data.fill_(2.0)
+    share = (0.05 * SLENDERNESS) ** 2 / 0.5
+    sagged = make_effect("payload", facts(gravity=level))
+    sagged.body_sag.data.fill_(-2.0 * share)
+    expected = sagged.double().apply(long, long.new_zeros(0)).detach()
+    assert torch.allclose(along(stiff, long)[0], expected, atol=1e-3)
+    stiff.sag.data.fill_(0.0)
+    stiff.own.data.fill_(0.1)
+    assert torch.allclose(along(stiff, long)[0], STRAIGHT * (1.05 - 0.05 * 0.1 * share), atol=1e-3)
+
+
+def test_energies_of_a_much_strained_body_are_those_of_its_hardest_postures():
+    shapes = torch.stack([arc(1e-3 + angle) for angle in torch.linspace(0.0, 1.0, 101).tolist()])
+    shapes[7, 3] = torch.nan
+    found = dict(most_strained(STRAIGHT.float(), shapes.float()))
+    # The node at the clamp bends half as much.
+    mean = (NODES - 2 + 0.25) / (NODES - 1)
+    assert found == {each: pytest.approx(0.98**2 * mean, rel=0.01) for each in ENERGIES}
+    assert most_strained(STRAIGHT.float(), STRAIGHT.float().expand(5, -1, -1)) == []
+    assert most_strained(STRAIGHT.float(), shapes[:1].float()) == []
+
+
+@pytest.mark.parametrize("name", ["stiffening", "softening"])
+def test_energies_of_a_body_are_named(name):
+    with pytest.raises(InputError, match="unknown energy of the body 'some'"):
+        make_effect(name, facts(), body="some")

@@ -106,6 +106,16 @@ def test_a_body_that_softens_says_how_much_more_it_bends_stretches_and_sags():
     )
 
 
+def test_a_body_that_stiffens_says_how_much_less_it_bends_stretches_and_sags():
+    stiff = make_effect("stiffening", FACTS, body="whole", full=0.25, weight=True)
+    words = in_words(with_amplitudes(stiff, bend=0.2, own=0.1, sag=3.0).readings())
+    assert words == (
+        "where it bends by 29 deg over its length, 20 % less, "
+        "where it stretches as much for its wall, 10 % less, "
+        "a body that is as stiff everywhere, held straight and level, sags by 3 mm less"
+    )
+
+
 def test_of_many_couplings_the_six_largest_are_told():
     """Six chambers have 30 of them: the largest first, and how many more there are."""
     six = replace(FACTS, low=torch.zeros(6), high=torch.full((6,), 100.0), rest=torch.zeros(6))

@@ -20,7 +20,7 @@ in energy |
 polynomial of loads; of their difference |
 | `dead_zone` | bladder that pushes from a pressure on: a corner | smoothed by a root |
 | `drift` | base that turns with the root of time (Fick 1855: swelling) | saturating exponential |
-| `stiffening` | polynomial of strain (Yeoh 1993) in the joints | exponential (Fung) on loads |
+| `stiffening` | polynomial of strain (Yeoh 1993) in the joints | exponential (Fung) |
 | `twist` | torsion that saturates with the mean load | polynomial of the mean load |
 | `thermal_drift` | modulus under a thermostat's saw tooth, weight included | gain by temperature |
 

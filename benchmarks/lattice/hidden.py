@@ -21,7 +21,7 @@ in energy |
 difference |
 | `dead_zone` | bladders that touch the wall later towards the tip | smoothed by a root |
 | `drift` | base that turns with the cube root of time (Andrade 1910) | saturating exponential |
-| `stiffening` | crimped threads that become taut (Lanir 1979) | exponential (Fung) of loads |
+| `stiffening` | crimped threads that become taut (Lanir 1979) | exponential (Fung) |
 | `twist` | right-handed fibres stiffer than left-handed ones | polynomial of mean load |
 | `thermal_drift` | modulus falls exponentially and the wall expands, late | gain by temperature |
 

@@ -25,7 +25,7 @@ pressures (Hencky 1915) | polynomial of loads; of their difference or its root |
 | `dead_zone` | parts of a bladder touch the wall one after the other | smoothed by a root |
 | `drift` | mount that creeps with the logarithm of time (Phillips 1905) | saturating exponential |
 | `stiffening` | joints whose stiffness grows with the square of bending: MuJoCo's polynomial | \
-exponential (Fung) of loads |
+exponential (Fung) |
 | `twist` | chambers' fibres lean over each joint: the tendon's way | polynomial of mean load |
 | `thermal_drift` | stiffness by a power of absolute temperature, weight included | gain by \
 temperature |

@@ -27,7 +27,7 @@ of loads; of their difference |
 smoothed by a root |
 | `drift` | base that turns with a hyperbola of time (Ross 1937) | saturating exponential |
 | `stiffening` | chains of limited length under the section's mean square strain (Kuhn & Gruen \
-1942; Cohen 1991) | exponential (Fung) of loads |
+1942; Cohen 1991) | exponential (Fung) |
 | `twist` | helical fibres: stretch turns the sections, and torsion stretches them (Love 1927) | \
 polynomial of the mean load |
 | `thermal_drift` | entropic modulus, of a wall that follows the room (James & Guth 1943), weight \

@@ -110,11 +110,15 @@ class Twist(Effect):
         return {"hanging": None if self.hanging is None else value_of(self.hanging)}
 
     def quantities(self) -> list[Quantity]:
-        """Twist of the tip at full load, its linear and quadratic part, rad."""
+        """Linear and quadratic part of the twist of the tip at full load, and the twist at half of
+        it, rad."""
         fibres = "arms that are meant to bend, not to twist (Connolly et al. 2017)"
+        parts = "of opposite signs where the twist saturates or sets in late"
+        half = float((self.linear / 2 + self.quadratic / 4).detach())
         twist = [
-            Quantity("linear_rad", value_of(self.linear), "rad", -1.0, 1.0, fibres),
-            Quantity("quadratic_rad", value_of(self.quadratic), "rad", -1.0, 1.0, fibres),
+            Quantity("linear_rad", value_of(self.linear), "rad", -4.0, 4.0, parts),
+            Quantity("quadratic_rad", value_of(self.quadratic), "rad", -4.0, 4.0, parts),
+            Quantity("half_load_rad", half, "rad", -1.0, 1.0, fibres),
         ]
         if self.hanging is None:
             return twist

@@ -528,3 +528,13 @@ STRAIGHT_13 = torch.outer(torch.linspace(0, 60, 13), torch.tensor([0.0, 0.0, 1.0
 def twist_length() -> float:
     """Sum of the quarter circle's chords, mm."""
     return float(QUARTER.diff(dim=0).norm(dim=-1).sum())
+
+
+def test_a_twist_that_saturates_is_plausible_and_one_by_more_than_a_radian_at_half_load_is_not():
+    """Parts of opposite signs: 0.75 rad at half load; one part alone: 1.5 rad."""
+    saturating = with_strength(make_effect("twist", RANGE), linear=3.3, quadratic=-3.6)
+    large = with_strength(make_effect("twist", RANGE), linear=3.0, quadratic=0.0)
+    assert saturating.plausible()
+    assert not large.plausible()
+    (half,) = [q.value for q in saturating.quantities() if q.name == "half_load_rad"]
+    assert half == pytest.approx(0.75)

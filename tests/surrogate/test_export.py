@@ -29,8 +29,8 @@ from surgisoft.surrogate.export import FILES, ArmGraph, differences, export_arm
 from surgisoft.surrogate.networks import ConstantCurvature, HawNN, KernelArm, RecurrentArm
 
 ROOT = Path(__file__).resolve().parents[2]
-SMALL = ("drift", "hysteresis", "misalignment")
-"""Effects whose amplitudes are angles of the whole body, or many."""
+SMALL = ("drift", "hysteresis", "misalignment", "stiffening#2", "softening#2", "softening#3")
+"""Effects whose amplitudes are angles of the whole body, or many, or that act on the body."""
 
 
 def small_arm(effects=None):
@@ -45,10 +45,15 @@ def small_arm(effects=None):
 
 
 def every_effect():
-    """Each effect of the package once, and a drift with the temperature; amplitudes that matter."""
+    """Each effect of the package once, and some in other forms; amplitudes that matter."""
     arm = default_arm()
     made = {name: make_effect(name, arm.facts) for name in EFFECTS}
     made["drift#2"] = make_effect("drift", arm.facts, kind="temperature")
+    weighs = {"body": "whole", "weight": arm.facts.gravity is not None}
+    made["stiffening#2"] = make_effect("stiffening", arm.facts, full=4.0, **weighs)
+    made["softening#2"] = make_effect("softening", arm.facts, width=1.0, damage=True, **weighs)
+    made["softening#3"] = make_effect("softening", arm.facts, width=1.0, body="apart")
+    made["coupling#2"] = make_effect("coupling", arm.facts, who="beside", power=0.5)
     torch.manual_seed(1)
     for name, effect in made.items():
         for value in effect.amplitudes().values():

@@ -1,7 +1,7 @@
 """Bending and stretch of a body through its key points, from segment to segment.
 
 The nodes of a body are its clamp and its key points, straight lines join them. At each node the
-body bends by the rotation vector that turns the direction of the line before it into that of the
+body bends by the rotation that turns the direction of the line before it into that of the
 line behind it; the line before the first node has the direction that the first line has at rest.
 Each line stretches against its length at rest. All of it follows from measured key points and holds
 for any cause of the bending, weight included.
@@ -20,7 +20,10 @@ ENERGIES = ("apart", "whole")
 HARD = 0.98
 """Quantile over recordings of the mean energy of the nodes at which a body is much strained."""
 TINY = 1e-6
-"""Length, mm, and sine of an angle below which a direction is not divided by them."""
+"""Length below which a line has no direction, mm."""
+FOLDED = 0.1
+"""One plus the cosine of an angle between lines below which a body that is folded back bends no
+more [-]."""
 
 
 class BentBody(nn.Module):
@@ -60,17 +63,18 @@ class BentBody(nn.Module):
     def strains(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """(bending (..., K, 3), stretch (..., K)) at K nodes of key points (..., n, 3), mm.
 
-        The bending is a rotation vector, rad, the stretch a change of length over the length.
+        The bending is a vector along the axis of the rotation with twice the tangent of half its
+        angle (Rodrigues 1840), which is the angle in rad to third order and needs no arc function;
+        the stretch is a change of length over the length.
         """
         lines = self._lines(points)
         lengths = lines.norm(dim=-1)
         along = lines / lengths.clamp(min=TINY).unsqueeze(-1)
         first = self.clamp.expand_as(along[..., :1, :])
         before = torch.cat([first, along[..., :-1, :]], dim=-2)
-        turned = torch.linalg.cross(before, along, dim=-1)
-        sine, cosine = turned.norm(dim=-1), (before * along).sum(-1)
-        angle = torch.atan2(sine, cosine) / sine.clamp(min=TINY)
-        return turned * angle.unsqueeze(-1), lengths / self.lengths - 1.0
+        cosine = (before * along).sum(-1, keepdim=True)
+        turned = torch.linalg.cross(before, along, dim=-1) / (1 + cosine).clamp(min=FOLDED)
+        return 2 * turned, lengths / self.lengths - 1.0
 
     def _beyond_rest(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """(bending (..., K, 3), stretch (..., K)) less those of the shape at rest."""

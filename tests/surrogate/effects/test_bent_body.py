@@ -50,15 +50,18 @@ def along(effect, *shapes: torch.Tensor) -> torch.Tensor:
 
 @given(st.floats(0.1, 2.0), st.floats(-3.0, 3.0), st.floats(0.9, 1.2))
 def test_an_arc_bends_by_its_angle_everywhere_and_stretches_by_its_length(angle, towards, longer):
-    """The rotation vectors add up to the angle, less half a step at the clamp and at the tip."""
+    """Each node turns by the angle of a step, half of it at the clamp: twice tan of the half."""
     bend, stretch = body().strains(arc(angle, towards, longer * LENGTH))
     across = torch.tensor([-math.sin(towards), math.cos(towards), 0.0]).double()
-    whole = angle * (1 - 0.5 / (NODES - 1))
-    assert torch.allclose(bend.sum(0), whole * across, atol=1e-9)
+    node, clamp = (2 * math.tan(angle / part) for part in (40, 80))
+    assert torch.allclose(bend[0], clamp * across, atol=1e-9)
+    assert torch.allclose(bend[1:], (node * across).expand(NODES - 2, 3), atol=1e-9)
     chord = longer * math.sin(angle / 40) / (angle / 40) - 1
     assert torch.allclose(stretch, torch.full_like(stretch, chord), atol=1e-6)
     energy = body().energies(arc(angle, towards, longer * LENGTH))
-    assert torch.allclose(energy[1:, 0], torch.full((NODES - 2,), angle**2).double(), rtol=1e-5)
+    assert torch.allclose(
+        energy[1:, 0], torch.full((NODES - 2,), (20 * node) ** 2).double(), rtol=1e-5
+    )
     square = torch.full((NODES - 1,), (SLENDERNESS * chord) ** 2).double()
     assert torch.allclose(energy[:, 1], square, rtol=1e-4, atol=1e-6)
 

@@ -275,7 +275,7 @@ def test_a_sentence_leaves_out_what_recordings_do_not_determine():
 def test_an_effect_of_a_user_says_its_single_numbers():
     effect = EFFECTS["twist"]
     said = super(type(effect), effect).readings()
-    assert [each.text for each in said] == ["linear {}", "quadratic {}"]
+    assert [each.text for each in said] == ["linear {}", "quadratic {}", "half load {}"]
     assert [each.unit for each in said] == ["rad", "rad"]
 
 

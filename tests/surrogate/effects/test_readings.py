@@ -276,7 +276,7 @@ def test_an_effect_of_a_user_says_its_single_numbers():
     effect = EFFECTS["twist"]
     said = super(type(effect), effect).readings()
     assert [each.text for each in said] == ["linear {}", "quadratic {}", "half load {}"]
-    assert [each.unit for each in said] == ["rad", "rad"]
+    assert [each.unit for each in said] == ["rad", "rad", "rad"]
 
 
 def test_an_effect_of_a_user_says_a_number_of_each_chamber_in_front_of_the_network():

@@ -52,13 +52,9 @@ class Beam:
         Where the lowest key point is not at the base, the clamp is at the frame's origin. A rest
         shape that is not known (zeros) counts as evenly spaced points of 1 mm.
         """
-        rest = np.asarray(rest_mm.detach().cpu(), np.float64)
+        rest, below = shape_at_rest(rest_mm)
         n = len(rest)
-        steps = np.linalg.norm(np.diff(rest, axis=0), axis=1)
-        if not rest.any() or not (steps > 0).all():
-            rest = np.arange(1.0, n + 1)[:, None] * np.array([0.0, 0.0, 1.0])
-        below = int(n == 1 or np.linalg.norm(rest[0]) > BASE_SHARE * steps.sum())
-        nodes = np.concatenate([np.zeros((below, 3)), rest])
+        nodes = np.concatenate([np.zeros((int(below), 3)), rest])
         chords = np.linalg.norm(np.diff(nodes, axis=0), axis=1)
         knots = np.concatenate([[0.0], np.cumsum(chords)])
         cuts = knots[:-1, None] + chords[:, None] * np.arange(CUTS) / CUTS
@@ -93,6 +89,30 @@ class Beam:
             _shares(knots)[below:],
         )
 
+    @property
+    def tip_lever(self) -> Tensor:
+        """(n, K) lever of a load at the tip for 1 mm of sag of the arm held straight and level."""
+        return self.levers[-1] * (3 / self.length_mm**3)
+
+    @property
+    def body_lever(self) -> Tensor:
+        """(n, K) the same of a load along the body."""
+        return self.weights * (8 / self.length_mm**4)
+
+
+def shape_at_rest(rest_mm: Tensor) -> tuple[np.ndarray, bool]:
+    """((n, 3) key points at rest, mm, whether the clamp lies below the lowest one).
+
+    rest_mm: (n, 3), mm, base frame; one that is not known (zeros) counts as evenly spaced points of
+    1 mm. Where the lowest key point is not at the base, the clamp is at the frame's origin.
+    """
+    rest = np.asarray(rest_mm.detach().cpu(), np.float64)
+    steps = np.linalg.norm(np.diff(rest, axis=0), axis=1)
+    if not rest.any() or not (steps > 0).all():
+        rest = np.arange(1.0, len(rest) + 1)[:, None] * np.array([0.0, 0.0, 1.0])
+    below = len(rest) == 1 or np.linalg.norm(rest[0]) > BASE_SHARE * steps.sum()
+    return rest, bool(below)
+
 
 class Sagging(nn.Module):
     """Displacement of key points by the own weight of a body that sags by 1 mm at its tip when it
@@ -108,9 +128,9 @@ class Sagging(nn.Module):
         super().__init__()
         beam = Beam.through(rest_mm)
         self.length_mm = beam.length_mm
-        lever = beam.weights * (8 / beam.length_mm**4)
-        for name, value in (("lever", lever), ("chords", beam.chords), ("collect", beam.collect)):
-            self.register_buffer(name, value, persistent=False)
+        self.register_buffer("lever", beam.body_lever, persistent=False)
+        self.register_buffer("chords", beam.chords, persistent=False)
+        self.register_buffer("collect", beam.collect, persistent=False)
         self.register_buffer("down", torch.tensor(gravity).float().unsqueeze(-1), persistent=False)
 
     def forward(self, points: Tensor) -> Tensor:

@@ -1,20 +1,19 @@
 """Bending and stretch of a body through its key points, from segment to segment.
 
-The nodes of a body are its clamp and its key points, straight lines join them. At each node the
-body bends by the rotation that turns the direction of the line before it into that of the
-line behind it; the line before the first node has the direction that the first line has at rest.
-Each line stretches against its length at rest. All of it follows from measured key points and holds
-for any cause of the bending, weight included.
+The nodes of a body are its clamp and its key points; straight lines join them. The bending at a
+node is the rotation from the direction of the line below it to that of the line above it; below the
+clamp, the direction is that of the first line at rest. The stretch of a line is relative to its
+length at rest. Both follow from the key points alone, whatever bends the body, weight included.
 """
 
 import torch
 from torch import Tensor, nn
 
-from surgisoft.surrogate.effects.beam import BASE_SHARE
+from surgisoft.surrogate.effects.beam import shape_at_rest
 
 SLENDERNESS = 10.0
-"""Length over radius of an arm: a wall that is stretched by 1 / SLENDERNESS is strained as one that
-is bent by 1 rad over the length [-]."""
+"""Length over radius of an arm, a round number: a wall that is stretched by 1 / SLENDERNESS is
+strained as one that is bent by 1 rad over the length [-]."""
 ENERGIES = ("apart", "whole")
 """Energies of a wall: that of bending and that of stretch, or their sum."""
 HARD = 0.98
@@ -35,18 +34,10 @@ class BentBody(nn.Module):
     rest_stretch: Tensor
 
     def __init__(self, rest_mm: Tensor):
-        """rest_mm: (n, 3) key points at rest, mm, base frame.
-
-        Where the lowest key point is not at the base, the clamp is at the frame's origin. A rest
-        shape that is not known (zeros) counts as evenly spaced points of 1 mm.
-        """
+        """rest_mm: (n, 3) key points at rest, mm, base frame, as `shape_at_rest` takes them."""
         super().__init__()
-        rest = rest_mm.detach().float()
-        steps = (rest[1:] - rest[:-1]).norm(dim=1)
-        if not rest.any() or not bool((steps > 0).all()):
-            rest = torch.arange(1.0, len(rest) + 1)[:, None] * torch.tensor([0.0, 0.0, 1.0])
-            steps = (rest[1:] - rest[:-1]).norm(dim=1)
-        self.below = len(rest) == 1 or float(rest[0].norm()) > BASE_SHARE * float(steps.sum())
+        shape, self.below = shape_at_rest(rest_mm)
+        rest = torch.tensor(shape, dtype=torch.float32)
         lines = self._lines(rest)
         lengths = lines.norm(dim=1)
         self.register_buffer("lengths", lengths, persistent=False)
@@ -99,10 +90,10 @@ class BentBody(nn.Module):
         return found if energies == "apart" else found.sum(-1, keepdim=True).expand_as(found)
 
     def moved(self, points: Tensor, more: Tensor) -> tuple[Tensor, Tensor]:
-        """Two displacements (..., n, 3), mm: shares `more` (..., K, 2) of bending and of stretch
-        beyond those at rest.
+        """Displacements (..., n, 3), mm, by more bending and by more stretch, to first order.
 
-        To first order: what bends at a node turns everything beyond it.
+        more: (..., K, 2) shares of the bending and of the stretch beyond those at rest that are
+        added. What bends at a node turns everything beyond it.
         """
         bend, stretch = self._beyond_rest(points)
         lines = self._lines(points)
@@ -118,7 +109,7 @@ class BentBody(nn.Module):
 
 
 def most_strained(rest_mm: Tensor, points: Tensor) -> list[tuple[str, float]]:
-    """For each of ENERGIES that of a body that is much strained, rad^2; none of a body at rest.
+    """(one of ENERGIES, its value at HARD in rad^2) of each; none of a body that does not move.
 
     rest_mm: (n, 3) key points at rest, mm; points: (S, n, 3) those of recordings, mm, NaN where
     missing.

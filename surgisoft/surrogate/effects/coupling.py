@@ -134,7 +134,9 @@ class Coupling(Memoryless):
         return [
             Quantity("linear_share", value_of(self.linear), "", -0.3, 0.5, wall),
             Quantity(f"{self._second}_share", value_of(second), "", least, most, wall),
-            Quantity("total_share", total, "", 0.0, max(most, 0.5), "neighbours take push"),
+            Quantity(
+                "total_share", total, "", 0.0, max(most, 0.5), "neighbours take push and give none"
+            ),
         ]
 
     def readings(self, seconds: float | None = None) -> list[Reading]:

@@ -39,9 +39,7 @@ class Payload(Memoryless):
         self.body_sag = amplitude(len(down))
         self.register_buffer("down", down.float(), persistent=False)
         # As levers of unit sags: C F = 3 tip_sag / L^3 and C w = 8 body_sag / L^4.
-        lever = torch.stack(
-            [beam.levers[-1] * (3 / self.length_mm**3), beam.weights * (8 / self.length_mm**4)]
-        )
+        lever = torch.stack([beam.tip_lever, beam.body_lever])
         self.register_buffer("lever", lever, persistent=False)
         self.register_buffer("chords", beam.chords, persistent=False)
         self.register_buffer("collect", beam.collect, persistent=False)

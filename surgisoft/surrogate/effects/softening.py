@@ -35,7 +35,6 @@ of e_k, each for itself, or the sum of both, in rad^2 over the whole length.
 import torch
 from torch import Tensor, nn
 
-from surgisoft.errors import unknown_name
 from surgisoft.surrogate.effects.base import (
     ArmFacts,
     Context,
@@ -46,8 +45,7 @@ from surgisoft.surrogate.effects.base import (
     logarithm,
     value_of,
 )
-from surgisoft.surrogate.effects.beam import Sagging
-from surgisoft.surrogate.effects.bent_body import ENERGIES, BentBody, most_strained
+from surgisoft.surrogate.effects.bent_body import most_strained
 from surgisoft.surrogate.effects.hypothesis import Hypothesis, no_combinations
 from surgisoft.surrogate.effects.readings import Reading
 from surgisoft.surrogate.effects.wall_fibres import WallFibres, bend_and_stretch, walls_tried
@@ -67,8 +65,6 @@ OTHERS = -0.35
 class Softening(WallFibres):
     """Softening by the largest load of a chamber and of all of them, or by the largest strain."""
 
-    bent: BentBody
-    sagging: Sagging
     log_growth: nn.Parameter
     """Logarithm of the growth; None with damage and of the body."""
     stage: Stage = "material"
@@ -95,28 +91,18 @@ class Softening(WallFibres):
         its own weight, whose direction must then be known.
         """
         super().__init__(facts)
-        if body is not None and body not in ENERGIES:
-            raise unknown_name("energy of the body", body, ENERGIES)
-        self.damage, self.body, self.weight = bool(damage), body, bool(weight)
+        self.damage = bool(damage)
         self.own = amplitude(1)
         self.common = amplitude(1)
         self.log_width = logarithm(width)
         spread = None if damage or body else logarithm(growth)
         self.register_parameter("log_growth", spread)
-        self.set_fibres(others, ring, section or body is not None)
-        if body is not None:
-            self.stage = "body"
-            self.bent = BentBody(facts.rest_mm)
-        if weight:
-            assert facts.gravity is not None, "a sag by weight needs the direction of gravity"
-            self.sag = amplitude(1)
-            self.sagging = Sagging(facts.rest_mm, facts.gravity)
+        self.set_fibres(others, ring, section, body, weight)
 
     def amplitudes(self) -> dict[str, nn.Parameter]:
         """`own` (1,) by each fibre's load and `common` (1,) by all chambers' loads; of a section
         or the body by its bending and its stretch; `sag` (1,) of the body by its weight, mm."""
-        given = {"own": self.own, "common": self.common}
-        return {**given, "sag": self.sag} if self.weight else given
+        return {"own": self.own, "common": self.common, **self.sag_amplitude()}
 
     def memory_parameters(self) -> list[nn.Parameter]:
         """The fibres' mixture."""
@@ -150,7 +136,7 @@ class Softening(WallFibres):
         """(R, T, ...) largest energies along the signal (R, T, ...)."""
         return torch.maximum(self.energy(signal).cummax(dim=1).values, memory.unsqueeze(1))
 
-    def lost(self, signal: Tensor, memory: Tensor) -> Tensor:
+    def _lost(self, signal: Tensor, memory: Tensor) -> Tensor:
         """Share of the stiffness that is lost at amplitude one, in the shape of the memory."""
         width = self.log_width.exp()
 
@@ -166,12 +152,9 @@ class Softening(WallFibres):
 
     def _softened(self, signal: Tensor, memory: Tensor) -> tuple[Tensor, ...]:
         """Changes of the signal, in its shape, at each amplitude of one."""
-        lost = self.lost(signal, memory)
+        lost = self._lost(signal, memory)
         if self.body is not None:
-            bent = self.bent.moved(signal, lost)
-            if not self.weight:
-                return bent
-            return *bent, self.sagging(signal) * lost[..., 0].mean(-1)[..., None, None]
+            return self.body_changes(signal, lost)
         load = self.load(signal)
         if self.section:
             bend, _, stretch = bend_and_stretch(load)
@@ -195,9 +178,8 @@ class Softening(WallFibres):
 
     def config(self) -> dict:
         """The fibres or what stands in their place, and whether the wall is damaged."""
-        section = self.section and self.body is None
-        own = {"section": section, "damage": self.damage, "body": self.body, "weight": self.weight}
-        return {**super().config(), **own}
+        forms = ("section", "damage", "body", "weight")
+        return {**super().config(), **{form: getattr(self, form) for form in forms}}
 
     def quantities(self) -> list[Quantity]:
         """Shares of push or strain that softening adds, its energy range, the fibres' mixture."""
@@ -221,18 +203,12 @@ class Softening(WallFibres):
         """Quantities of a body that softens."""
         wall = "wide: at most three quarters of the stiffness; a wall does not heal by load"
         angle = value_of((0.5 * self.log_width).exp())
-        quantities = [
+        return [
             Quantity("bend_share", value_of(self.own), "", 0.0, 3.0, wall),
             Quantity("stretch_share", value_of(self.common), "", -0.1, 3.0, wall),
-            Quantity(
-                "width_rad", angle, "rad", 1e-3, 20.0, "less than the recordings show to more"
-            ),
+            Quantity("width_rad", angle, "rad", 1e-3, 20.0, "far below and above what arms bend"),
+            *self.sag_quantity(),
         ]
-        if self.weight:
-            most = 0.5 * self.sagging.length_mm
-            source = "weight pulls down; to first order, so below half the length"
-            quantities.append(Quantity("sag_mm", value_of(self.sag), "mm", 0.0, most, source))
-        return quantities
 
     def readings(self, seconds: float | None = None) -> list[Reading]:
         """Change of a chamber's push at half load after a full load, %; of the body the largest
@@ -245,7 +221,7 @@ class Softening(WallFibres):
                 Reading(where.format("stretched", "stretches"), common, "%", common),
             ]
             if self.weight:
-                text = "a body that is as soft everywhere, held straight and level, sags by {} more"
+                text = "as soft everywhere, held straight and level, it would sag {} more"
                 readings.append(Reading(text, float(self.sag.detach()), "mm"))
             return readings
         with torch.no_grad():

@@ -35,7 +35,6 @@ import math
 import torch
 from torch import Tensor, nn
 
-from surgisoft.errors import unknown_name
 from surgisoft.surrogate.effects.base import (
     ArmFacts,
     Effect,
@@ -46,8 +45,7 @@ from surgisoft.surrogate.effects.base import (
     logarithm,
     value_of,
 )
-from surgisoft.surrogate.effects.beam import Sagging
-from surgisoft.surrogate.effects.bent_body import ENERGIES, BentBody, most_strained
+from surgisoft.surrogate.effects.bent_body import SLENDERNESS, most_strained
 from surgisoft.surrogate.effects.hypothesis import Hypothesis, no_combinations
 from surgisoft.surrogate.effects.readings import Reading
 from surgisoft.surrogate.effects.wall_fibres import WallFibres, bend_and_stretch, walls_tried
@@ -66,8 +64,6 @@ OTHERS = -0.35
 class Stiffening(WallFibres, Memoryless):
     """Progressive loss of push, equal for all chambers, or of strain along the body."""
 
-    bent: BentBody
-    sagging: Sagging
     stage: Stage = "material"
 
     def __init__(
@@ -90,26 +86,16 @@ class Stiffening(WallFibres, Memoryless):
         then be known.
         """
         super().__init__(facts)
-        if body is not None and body not in ENERGIES:
-            raise unknown_name("energy of the body", body, ENERGIES)
-        self.body, self.full, self.weight = body, float(full), bool(weight)
+        self.full = float(full)
         self.own = amplitude(1)
         self.bend = amplitude(1)
         self.log_steepness = logarithm(steepness)
-        self.set_fibres(others, ring, section or body is not None)
-        if body is not None:
-            self.stage = "body"
-            self.bent = BentBody(facts.rest_mm)
-        if weight:
-            assert facts.gravity is not None, "a sag by weight needs the direction of gravity"
-            self.sag = amplitude(1)
-            self.sagging = Sagging(facts.rest_mm, facts.gravity)
+        self.set_fibres(others, ring, section, body, weight)
 
     def amplitudes(self) -> dict[str, nn.Parameter]:
         """`own` (1,) by each fibre's load, or the stretch, and `bend` (1,) by the arm's bending;
         `sag` (1,) of the body by its weight, mm."""
-        given = {"own": self.own, "bend": self.bend}
-        return {**given, "sag": self.sag} if self.weight else given
+        return {"own": self.own, "bend": self.bend, **self.sag_amplitude()}
 
     def _share(self, energy: Tensor) -> Tensor:
         """Share of the loss at full load, at an energy over that at full load."""
@@ -120,11 +106,8 @@ class Stiffening(WallFibres, Memoryless):
         """Changes of the signal, in its shape, at each amplitude of one."""
         if self.body is not None:
             less = -self._share(self.bent.strained(signal, self.body) / self.full)
-            by_bend, by_stretch = self.bent.moved(signal, less)
-            if not self.weight:
-                return by_stretch, by_bend
-            sagged = self.sagging(signal) * less[..., 0].mean(-1)[..., None, None]
-            return by_stretch, by_bend, sagged
+            by_bend, by_stretch, *by_sag = self.body_changes(signal, less)
+            return by_stretch, by_bend, *by_sag
         x = self.load(signal)
         bend, size, stretch = bend_and_stretch(x)
 
@@ -153,15 +136,14 @@ class Stiffening(WallFibres, Memoryless):
 
     def config(self) -> dict:
         """The fibres, or what stands in their place."""
-        section = self.section and self.body is None
-        body = {"body": self.body, "full": self.full, "weight": self.weight}
-        return {**super().config(), "section": section, **body}
+        forms = ("section", "body", "full", "weight")
+        return {**super().config(), **{form: getattr(self, form) for form in forms}}
 
     def quantities(self) -> list[Quantity]:
         """Shares of push lost at full load, the steepness and the fibres' mixture."""
         rubber = "wide: a rest of the push is left"
         total = float((self.own + self.bend).detach())
-        own = "stretch_share" if self.section else "own_share"
+        own = "own_share" if self.others is not None else "stretch_share"
         less = -0.5 if self.body is None else -0.1
         quantities = [
             Quantity(own, value_of(self.own), "", less, 0.9, rubber),
@@ -176,28 +158,23 @@ class Stiffening(WallFibres, Memoryless):
             ),
             Quantity("steepness", value_of(self.log_steepness.exp()), "", 0.005, 12.0, rubber),
         ]
-        if self.weight:
-            most = 0.5 * self.sagging.length_mm
-            source = "to first order, so below half the length; what is stiffer does not sag more"
-            quantities.append(Quantity("sag_mm", value_of(self.sag), "mm", 0.0, most, source))
-        return [*quantities, *self.mixture()]
+        return [*quantities, *self.sag_quantity(), *self.mixture()]
 
     def readings(self, seconds: float | None = None) -> list[Reading]:
         """Push that is lost at full load, of one chamber alone and of all chambers at once, %; of
         the body what it bends and stretches less, %, and sags less, mm."""
         if self.body is not None:
             bend, own = (100 * float(each.detach()) for each in (self.bend, self.own))
-            angle = math.degrees(math.sqrt(self.full))
+            angle = math.sqrt(self.full)
+            most = f"{math.degrees(angle):.0f} degrees", f"{100 * angle / SLENDERNESS:.2g} %"
             readings = [
                 Reading(
-                    f"where it bends by {angle:.0f} deg over its length, {{}} less", bend, "%", bend
+                    f"bent by {most[0]} from base to tip, the body bends {{}} less", bend, "%", bend
                 ),
-                Reading("where it stretches as much for its wall, {} less", own, "%", own),
+                Reading(f"stretched by {most[1]}, it stretches {{}} less", own, "%", own),
             ]
             if self.weight:
-                text = (
-                    "a body that is as stiff everywhere, held straight and level, sags by {} less"
-                )
+                text = "as stiff everywhere, held straight and level, it would sag {} less"
                 readings.append(Reading(text, float(self.sag.detach()), "mm"))
             return readings
         with torch.no_grad():

@@ -11,8 +11,10 @@ from abc import ABC
 import torch
 from torch import Tensor, nn
 
-from surgisoft.errors import InputError
-from surgisoft.surrogate.effects.base import Effect, Quantity, Stage, value_of
+from surgisoft.errors import InputError, unknown_name
+from surgisoft.surrogate.effects.base import Effect, Quantity, Stage, amplitude, value_of
+from surgisoft.surrogate.effects.beam import Sagging
+from surgisoft.surrogate.effects.bent_body import ENERGIES, BentBody
 
 RINGS = (3, 4)
 """Numbers of chambers that are assumed to stand in one ring; of other numbers nothing is known."""
@@ -27,17 +29,69 @@ class WallFibres(Effect, ABC):
     `others`."""
 
     others: nn.Parameter
-    """(1,) share of the other chambers; None of a section."""
+    """(1,) share of the other chambers; None of a section and of a body."""
+    sag: nn.Parameter
+    """(1,) change of the sag by the arm's own weight, mm; only of a body with `weight`."""
+    bent: BentBody
+    sagging: Sagging
 
-    def set_fibres(self, others: float, ring: bool, section: bool = False) -> None:
-        """Add the parameter of the mixture; others and ring are those of `fibre_matrix`.
+    def set_fibres(
+        self,
+        others: float,
+        ring: bool,
+        section: bool = False,
+        body: str | None = None,
+        weight: bool = False,
+    ) -> None:
+        """Choose what carries the loads; others and ring are those of `fibre_matrix`.
 
         section: the wall as a whole, which bends and stretches (`bend_and_stretch`), in place of
-        single fibres.
+        single fibres; body: one of ENERGIES, for the body in their place, behind the network;
+        weight: whether the sag of that body by its own weight changes, too. Raises InputError for
+        an unknown energy, and for a weight without a body or a direction of gravity.
         """
+        if body is not None and body not in ENERGIES:
+            raise unknown_name("energy of the body", body, ENERGIES)
+        if weight and (body is None or self.facts.gravity is None):
+            missing = "body" if body is None else "direction of gravity"
+            raise InputError(f"weight is true without a {missing}; expected one, or weight = false")
         self.ring, self.section = bool(ring), bool(section)
-        shared = None if section else nn.Parameter(torch.tensor([float(others)]))
+        self.body, self.weight = body, bool(weight)
+        mixed = not section and body is None
+        shared = nn.Parameter(torch.tensor([float(others)])) if mixed else None
         self.register_parameter("others", shared)
+        if body is not None:
+            self.stage = "body"
+            self.bent = BentBody(self.facts.rest_mm)
+        if weight:
+            assert self.facts.gravity is not None
+            self.sag = amplitude(1)
+            self.sagging = Sagging(self.facts.rest_mm, self.facts.gravity)
+
+    def sag_amplitude(self) -> dict[str, nn.Parameter]:
+        """`sag` for `amplitudes`, where there is a weight."""
+        return {"sag": self.sag} if self.weight else {}
+
+    def sag_quantity(self) -> list[Quantity]:
+        """`sag_mm` for `quantities`, where there is a weight."""
+        if not self.weight:
+            return []
+        most = 0.5 * self.sagging.length_mm
+        source = (
+            "a softer wall sags more, a stiffer one less; to first order, so below half the length"
+        )
+        return [Quantity("sag_mm", value_of(self.sag), "mm", 0.0, most, source)]
+
+    def body_changes(self, points: Tensor, more: Tensor) -> tuple[Tensor, ...]:
+        """Displacements (..., n, 3), mm, by bending, by stretch and, with a weight, by 1 mm of sag.
+
+        points: (..., n, 3) key points, mm; more: (..., K, 2) shares of bending and stretch that are
+        added at each node, of which the mean of the first one is that of the sag.
+        """
+        changes = self.bent.moved(points, more)
+        if not self.weight:
+            return changes
+        return *changes, self.sagging(points) * more[..., 0].mean(-1)[..., None, None]
 
     @property
     def fibres(self) -> Tensor:
@@ -49,8 +103,8 @@ class WallFibres(Effect, ABC):
         return self.load(signal) @ self.fibres.T
 
     def mixture(self) -> list[Quantity]:
-        """The mixture of the fibres' loads for `quantities`; none of a section."""
-        if self.section:
+        """The mixture of the fibres' loads for `quantities`; none of a section and of a body."""
+        if self.others is None:
             return []
         source = "a mixture of shares"
         return [Quantity("others_share", value_of(self.others), "", -1.0, 1.0, source)]

@@ -187,3 +187,11 @@ def test_energies_of_a_much_strained_body_are_those_of_its_hardest_postures():
 def test_energies_of_a_body_are_named(name):
     with pytest.raises(InputError, match="unknown energy of the body 'some'"):
         make_effect(name, facts(), body="some")
+
+
+@pytest.mark.parametrize("name", ["stiffening", "softening"])
+def test_a_weight_needs_a_body_and_the_direction_of_gravity(name):
+    with pytest.raises(InputError, match="weight is true without a body; expected one"):
+        make_effect(name, facts(gravity=(1.0, 0.0, 0.0)), weight=True)
+    with pytest.raises(InputError, match="weight is true without a direction of gravity"):
+        make_effect(name, facts(), body="whole", weight=True)

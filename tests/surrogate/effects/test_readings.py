@@ -102,7 +102,7 @@ def test_a_body_that_softens_says_how_much_more_it_bends_stretches_and_sags():
     assert words == (
         "where it was bent most, the body bends more by up to 20 %, "
         "where it was stretched most, the body stretches more by up to 10 %, "
-        "a body that is as soft everywhere, held straight and level, sags by 3 mm more"
+        "as soft everywhere, held straight and level, it would sag 3 mm more"
     )
 
 
@@ -110,9 +110,9 @@ def test_a_body_that_stiffens_says_how_much_less_it_bends_stretches_and_sags():
     stiff = make_effect("stiffening", FACTS, body="whole", full=0.25, weight=True)
     words = in_words(with_amplitudes(stiff, bend=0.2, own=0.1, sag=3.0).readings())
     assert words == (
-        "where it bends by 29 deg over its length, 20 % less, "
-        "where it stretches as much for its wall, 10 % less, "
-        "a body that is as stiff everywhere, held straight and level, sags by 3 mm less"
+        "bent by 29 degrees from base to tip, the body bends 20 % less, "
+        "stretched by 5 %, it stretches 10 % less, "
+        "as stiff everywhere, held straight and level, it would sag 3 mm less"
     )
 
 

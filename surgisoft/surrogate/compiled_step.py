@@ -54,7 +54,7 @@ class CompiledStep:
         name, effect = next(iter(effects.items()), (None, None))
         if type(network) is not HawNN or len(effects) > 1:
             return None
-        if not (effect is None or type(effect) is Hysteresis):
+        if not (effect is None or (type(effect) is Hysteresis and effect.body_rad is None)):
             return None
         tensors = [*model.parameters(), *model.buffers()]
         if any(t.device.type != "cpu" for t in tensors):

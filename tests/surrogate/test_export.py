@@ -53,6 +53,8 @@ def every_effect():
     made["stiffening#2"] = make_effect("stiffening", arm.facts, full=4.0, **weighs)
     made["softening#2"] = make_effect("softening", arm.facts, width=1.0, damage=True, **weighs)
     made["softening#3"] = make_effect("softening", arm.facts, width=1.0, body="apart")
+    made["creep#2"] = make_effect("creep", arm.facts, body=True)
+    made["hysteresis#2"] = make_effect("hysteresis", arm.facts, radii=(0.1, 0.3), body_rad=2.0)
     made["coupling#2"] = make_effect("coupling", arm.facts, who="beside", power=0.5)
     torch.manual_seed(1)
     for name, effect in made.items():

@@ -67,7 +67,7 @@ class BentBody(nn.Module):
         turned = torch.linalg.cross(before, along, dim=-1) / (1 + cosine).clamp(min=FOLDED)
         return 2 * turned, lengths / self.lengths - 1.0
 
-    def _beyond_rest(self, points: Tensor) -> tuple[Tensor, Tensor]:
+    def beyond_rest(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """(bending (..., K, 3), stretch (..., K)) less those of the shape at rest."""
         bend, stretch = self.strains(points)
         return bend - self.rest_bend, stretch - self.rest_stretch
@@ -78,7 +78,7 @@ class BentBody(nn.Module):
         points: (..., n, 3) key points, mm. A node bends as much as the whole arm would with the
         curvature there; a stretch of 1 / SLENDERNESS counts as a bending of 1 rad.
         """
-        bend, stretch = self._beyond_rest(points)
+        bend, stretch = self.beyond_rest(points)
         whole = (self.lengths.sum() / self.lengths).square()
         return torch.stack(
             [bend.square().sum(-1) * whole, (SLENDERNESS * stretch).square()], dim=-1
@@ -93,15 +93,21 @@ class BentBody(nn.Module):
         """Displacements (..., n, 3), mm, by more bending and by more stretch, to first order.
 
         more: (..., K, 2) shares of the bending and of the stretch beyond those at rest that are
-        added. What bends at a node turns everything beyond it.
+        added.
         """
-        bend, stretch = self._beyond_rest(points)
+        bend, stretch = self.beyond_rest(points)
+        return self.bent_further(points, bend * more[..., :1], stretch * more[..., 1])
+
+    def bent_further(self, points: Tensor, bend: Tensor, stretch: Tensor) -> tuple[Tensor, Tensor]:
+        """Displacements (..., n, 3), mm, by bending and by stretch that are added, to first order.
+
+        points: (..., n, 3) key points, mm; bend: (..., K, 3), as that of `strains`; stretch:
+        (..., K). What bends at a node turns everything beyond it.
+        """
         lines = self._lines(points)
-        turned = (bend * more[..., :1]).cumsum(dim=-2)
-        by_bend = torch.linalg.cross(turned, lines, dim=-1).cumsum(dim=-2)
+        by_bend = torch.linalg.cross(bend.cumsum(dim=-2), lines, dim=-1).cumsum(dim=-2)
         along = lines / lines.norm(dim=-1, keepdim=True).clamp(min=TINY)
-        longer = self.lengths * stretch * more[..., 1]
-        by_stretch = (along * longer.unsqueeze(-1)).cumsum(dim=-2)
+        by_stretch = (along * (self.lengths * stretch).unsqueeze(-1)).cumsum(dim=-2)
         if self.below:
             return by_bend, by_stretch
         still = torch.zeros_like(points[..., :1, :])

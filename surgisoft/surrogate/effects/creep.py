@@ -10,6 +10,14 @@ solids. A narrow spectrum is a single time, a wide one the power law t^n (Findle
 
 The load is held between two rows, and each element is integrated exactly.
 
+*Of the body.* A wall creeps under all that bends it, weight included, and each part by its own
+strain. So the elements follow the bending b_j and the stretch e_j beyond those at rest at each
+node j of the body (`bent_body`), and the solid is linear (Boltzmann 1874):
+
+    b_j -> b_j + amount sum_k w_k z_k(b_j),    e_j -> e_j + stretch sum_k w_k z_k(e_j).
+
+At rest nothing is added: an arm that has hung for long enough has crept under its weight.
+
 Under a constant pressure or force the wall gives way further: the amount is positive. Under a
 constant displacement, such as the pull of a tendon in mm, the wall and the tendon relax and the arm
 goes back (Findley 1976, ch. 5): the amount is negative. There both signs are plausible, because the
@@ -25,10 +33,12 @@ from surgisoft.surrogate.effects.base import (
     Context,
     Effect,
     Quantity,
+    Stage,
     amplitude,
     logarithm,
     value_of,
 )
+from surgisoft.surrogate.effects.bent_body import SLENDERNESS, BentBody, most_strained
 from surgisoft.surrogate.effects.hypothesis import Hypothesis
 from surgisoft.surrogate.effects.readings import Reading, duration
 from surgisoft.surrogate.scan import linear_scan
@@ -54,30 +64,48 @@ GRID = (
 
 
 class Creep(Effect):
-    """Delayed loads with a spectrum of retardation times, equal for all chambers."""
+    """Delayed loads, equal for all chambers, or strains, with a spectrum of retardation times."""
 
     times: Tensor
-
-    stage = "material"
+    log_power: nn.Parameter
+    """Logarithm of the load's power; None of the body."""
+    stretch: nn.Parameter
+    bent: BentBody
+    stage: Stage = "material"
 
     def __init__(
-        self, facts: ArmFacts, tau_s: float = 10.0, width: float = 1.5, power: float = 1.0
+        self,
+        facts: ArmFacts,
+        tau_s: float = 10.0,
+        width: float = 1.5,
+        power: float = 1.0,
+        body: bool = False,
     ):
-        """Centre of the spectrum, s, its width in natural logarithms, and the load's power."""
+        """Choose the spectrum and what creeps.
+
+        tau_s: centre of the spectrum, s; width: its width in natural logarithms; power: that of the
+        load; body: the strains of the body in place of loads, for which the power does not matter.
+        """
         super().__init__(facts)
+        self.body = bool(body)
         self.register_buffer("times", TIMES.float(), persistent=False)
         self.amount = amplitude(1)
         self.log_tau = logarithm(tau_s)
         self.log_width = logarithm(width)
-        self.log_power = logarithm(power)
+        self.register_parameter("log_power", None if self.body else logarithm(power))
+        if self.body:
+            self.stage = "body"
+            self.stretch = amplitude(1)
+            self.bent = BentBody(facts.rest_mm)
 
     def amplitudes(self) -> dict[str, nn.Parameter]:
-        """`amount` (1,): creep under full load after infinite time, as a share of the load."""
-        return {"amount": self.amount}
+        """`amount` (1,): creep after infinite time, as a share of the load at full load; of the
+        body as a share of its bending, and `stretch` (1,) as a share of its stretch."""
+        return {"amount": self.amount} | ({"stretch": self.stretch} if self.body else {})
 
     def memory_parameters(self) -> list[nn.Parameter]:
-        """The load's power; the spectrum only weighs the elements and is no part of it."""
-        return [self.log_power]
+        """The load's power, if there is one; the spectrum only weighs the elements."""
+        return [] if self.body else [self.log_power]
 
     @property
     def spectrum(self) -> Tensor:
@@ -86,43 +114,70 @@ class Creep(Effect):
         return torch.softmax(-0.5 * distance.square(), dim=0)
 
     def pull(self, signal: Tensor) -> Tensor:
-        """(..., m) the load to its power, from the actuation (..., m)."""
+        """What the elements follow: (..., m) the load to its power, from the actuation (..., m).
+
+        Of the body: (..., K, 4) bending of its K nodes and SLENDERNESS times their stretch beyond
+        those at rest, rad, from its key points (..., n, 3), mm.
+        """
+        if self.body:
+            bend, stretch = self.bent.beyond_rest(signal)
+            return torch.cat([bend, SLENDERNESS * stretch.unsqueeze(-1)], dim=-1)
         x = self.load(signal)
         return x * (x.square() + SMALL**2).pow((self.log_power.exp() - 1) / 2)
 
     def rest(self, signal: Tensor) -> Tensor:
-        """(B, m, K) elements that have not crept yet, as after a long time at no load."""
-        return signal.new_zeros(*signal.shape, len(self.times))
+        """(B, ..., K) elements that have not crept yet, as after a long time at no load."""
+        pull = self.pull(signal)
+        return pull.new_zeros(*pull.shape, len(self.times))
+
+    def _keep(self, context: Context, pull: Tensor) -> Tensor:
+        """What the elements keep of their way over a row, broadcast to (..., K) of the pull."""
+        dt = context.dt_s.reshape(*context.dt_s.shape, *[1] * (pull.dim() - context.dt_s.dim() + 1))
+        return torch.exp(-dt / self.times)
 
     def advance(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
-        """(B, m, K) retarded loads after the actuation (B, m)."""
-        keep = torch.exp(-context.dt_s[..., None, None] / self.times)
-        return keep * memory + (1 - keep) * self.pull(signal).unsqueeze(-1)
+        """(B, ..., K) elements after the signal (B, ...)."""
+        pull = self.pull(signal)
+        keep = self._keep(context, pull)
+        return keep * memory + (1 - keep) * pull.unsqueeze(-1)
 
     def scan(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
-        """(R, T, m, K) retarded loads along the actuation (R, T, m)."""
-        keep = torch.exp(-context.dt_s[..., None, None] / self.times)
-        return linear_scan(keep, (1 - keep) * self.pull(signal).unsqueeze(-1), memory)
+        """(R, T, ..., K) elements along the signal (R, T, ...)."""
+        pull = self.pull(signal)
+        keep = self._keep(context, pull)
+        return linear_scan(keep, (1 - keep) * pull.unsqueeze(-1), memory)
+
+    def _crept(self, signal: Tensor, memory: Tensor) -> tuple[Tensor, ...]:
+        """Changes of the signal, in its shape, at each amplitude of one."""
+        retarded = memory @ self.spectrum
+        if self.body:
+            bend, stretch = retarded[..., :3], retarded[..., 3] / SLENDERNESS
+            return self.bent.bent_further(signal, bend, stretch)
+        return (self.reach * retarded,)
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
-        """Effective actuation (..., m) from actuation (..., m) and retarded loads (..., m, K)."""
-        return signal + self.amount * self.reach * (memory @ self.spectrum)
+        """Signal behind the effect, in its shape, from the elements (..., K)."""
+        for size, change in zip(
+            self.amplitudes().values(), self._crept(signal, memory), strict=True
+        ):
+            signal = signal + size * change
+        return signal
 
     def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
-        """(1, ..., m) delayed actuation: closed form."""
-        return (self.reach * (memory @ self.spectrum)).unsqueeze(0).detach()
+        """(1, ...), of the body (2, ...), change of the signal by each amplitude: closed form."""
+        with torch.no_grad():
+            return torch.stack(self._crept(signal, memory))
 
     def config(self) -> dict:
-        """No arguments: tensors hold everything."""
-        return {}
+        """Whether the body creeps; tensors hold everything else."""
+        return {"body": self.body}
 
     def quantities(self) -> list[Quantity]:
-        """Amount, centre (s) and width of the spectrum, and the power of the load."""
+        """Amounts, centre (s) and width of the spectrum, and the power of the load."""
         low, why = 0.0, "wide: at most as much again as at once; a solid does not creep backwards"
         if is_displacement(self.facts.unit):
             low, why = -1.0, "wide: at most all of it is lost to relaxation, or as much again added"
-        return [
-            Quantity("amount_share", value_of(self.amount), "", low, 1.0, why),
+        spectrum = [
             Quantity(
                 "tau_s",
                 value_of(self.log_tau.exp()),
@@ -139,18 +194,19 @@ class Creep(Effect):
                 6.0,
                 "one time alone, to evenly over all decades",
             ),
-            Quantity(
-                "power",
-                value_of(self.log_power.exp()),
-                "",
-                0.3,
-                3.0,
-                "wide: 1 is a linear solid (Findley 1976, ch. 5)",
-            ),
         ]
+        amount = Quantity("amount_share", value_of(self.amount), "", low, 1.0, why)
+        if self.body:
+            little = min(low, -0.1)
+            stretch = Quantity("stretch_share", value_of(self.stretch), "", little, 1.0, why)
+            return [amount, stretch, *spectrum]
+        linear = "wide: 1 is a linear solid (Findley 1976, ch. 5)"
+        power = Quantity("power", value_of(self.log_power.exp()), "", 0.3, 3.0, linear)
+        return [amount, *spectrum, power]
 
     def readings(self, seconds: float | None = None) -> list[Reading]:
-        """Creep under a load that is held as long as the recordings last (%), and its half (s)."""
+        """Creep under a load that is held as long as the recordings last (%), and its half (s); of
+        the body that of its bending and of its stretch."""
         held = seconds or TEN_MINUTES
         times, spectrum = self.times.double(), self.spectrum.detach().double()
 
@@ -163,16 +219,29 @@ class Creep(Effect):
         for _ in range(HALVINGS):
             middle = (low + high) / 2
             low, high = (low, middle) if 2 * crept(middle) > whole else (middle, high)
-        grown = 100 * float(self.amount.detach()) * whole
-        text = f"push under a full load held for {duration(held)} {{+}}"
+        grown = [100 * float(each.detach()) * whole for each in self.amplitudes().values()]
+        what = ("bending", "stretch") if self.body else ("push",)
+        load = "load" if self.body else "full load"
+        held_for = f"under a {load} held for {duration(held)} {{+}}"
         return [
-            Reading(text, grown, "%", signed=True),
+            *(
+                Reading(f"{each} {held_for}", more, "%", signed=True)
+                for each, more in zip(what, grown, strict=True)
+            ),
             Reading("half of the creep comes within {}", high, "s"),
         ]
 
 
 def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
-    return [Creep(facts, tau, width) for tau, width in GRID]
+    """Spectra of the loads, and of the strains of a body that does not rest."""
+    moves = bool(most_strained(facts.rest_mm, points))
+    forms = (False, True) if moves else (False,)
+    return [Creep(facts, tau, width, body=body) for body in forms for tau, width in GRID]
 
 
-HYPOTHESIS = Hypothesis(Creep, _grid, memory="time")
+def _together(some: list[Effect]) -> list[list[int]]:
+    """All spectra of the loads side by side; one of the body stands alone."""
+    return [[i for i, each in enumerate(some) if not getattr(each, "body", False)]]
+
+
+HYPOTHESIS = Hypothesis(Creep, _grid, combinations=_together, memory="time")

@@ -15,13 +15,30 @@ whose mixture a, b is fitted with the rest. Superposed (Kuhnen 2003, eq. 8) they
 where v lets a loop's width depend on where it lies. Backlash of a valve, a tendon or a joint of one
 chamber is a sum of plays of the chamber's own actuation, x_eff_i = x_i + sum_k w_ik (y_ik - x_i).
 With w = v = 0 nothing changes.
+
+*Of the body.* Friction in the wall also holds back what weight and other chambers bend. So plays
+run along the strains of each node of the body (`body_plays`), with the same weights at all nodes:
+
+    b -> b + sum_k w_k (lag of b by the plays of radius r_k),    the same with v_k for the stretch.
 """
+
+import math
 
 import torch
 from torch import Tensor, nn
 
 from surgisoft.surrogate.arm import centre_and_half
-from surgisoft.surrogate.effects.base import ArmFacts, Context, Effect, Quantity, value_of
+from surgisoft.surrogate.effects.base import (
+    ArmFacts,
+    Context,
+    Effect,
+    Quantity,
+    Stage,
+    amplitude,
+    value_of,
+)
+from surgisoft.surrogate.effects.bent_body import most_strained
+from surgisoft.surrogate.effects.body_plays import BodyPlays
 from surgisoft.surrogate.effects.hypothesis import Hypothesis
 from surgisoft.surrogate.effects.readings import Reading
 from surgisoft.surrogate.effects.wall_fibres import RINGS, fibre_matrix
@@ -47,8 +64,8 @@ class Hysteresis(Effect):
     radius: Tensor
     use: Tensor
     turns: Tensor
-
-    stage = "material"
+    plays: BodyPlays
+    stage: Stage = "material"
 
     def __init__(
         self,
@@ -59,6 +76,7 @@ class Hysteresis(Effect):
         others: float = 0.0,
         section: bool = False,
         chamber: int | None = None,
+        body_rad: float | None = None,
     ):
         """Radii of the play operators, in units of half a line's range.
 
@@ -67,13 +85,15 @@ class Hysteresis(Effect):
         others: share of the other chambers in each line to start from, negative where a chamber
         that bends the arm shortens the wall on the other side; section: the lines, those along
         pairs too, are those of a plane section (`fibre_matrix`), others being that of a neighbour;
-        chamber: the number of the only chamber that has plays, of its own actuation; the other
-        choices do not matter then.
+        chamber: the number of the only chamber that has plays, of its own actuation; body_rad: the
+        bending over the whole arm that is the radius 1 of plays on the strains of the body, rad.
+        With either of the last two the other choices do not matter.
         """
         super().__init__(facts)
         chambers = len(facts.low)
         self.radii, self.chamber = tuple(radii), chamber
-        several = chamber is None
+        self.body_rad = None if body_rad is None else float(body_rad)
+        several = chamber is None and body_rad is None
         self.ring, self.pairs = bool(ring) and several, bool(pairs) and several
         centre, half = centre_and_half(facts.low, facts.high)
         self.register_buffer("centre", centre)
@@ -95,7 +115,11 @@ class Hysteresis(Effect):
             lines = lines / lines.abs().sum(1, keepdim=True)
         self.linear = nn.Parameter(lines)
         self.bent = nn.Parameter(lines.new_zeros(len(lines), chambers, chambers))
-        if chamber is not None:
+        if self.body_rad is not None:
+            self.stage = "body"
+            self.bend, self.stretch = amplitude(len(self.radii)), amplitude(len(self.radii))
+            self.plays = BodyPlays(facts.rest_mm, self.body_rad)
+        elif chamber is not None:
             self.own = nn.Parameter(torch.zeros(len(self.radii)))
         elif self.ring:
             self.turned = nn.Parameter(torch.zeros(len(lines), len(self.radii)))
@@ -107,7 +131,9 @@ class Hysteresis(Effect):
 
     def amplitudes(self) -> dict[str, nn.Parameter]:
         """`weight` and `slope` (m, L, J); of alike chambers in a ring `turned` (L, J); of one
-        chamber `own` (J,)."""
+        chamber `own` (J,); of the body `bend` and `stretch` (J,)."""
+        if self.body_rad is not None:
+            return {"bend": self.bend, "stretch": self.stretch}
         if self.chamber is not None:
             return {"own": self.own}
         if self.ring:
@@ -125,8 +151,14 @@ class Hysteresis(Effect):
         return x @ self.linear.T + products @ self.bent.flatten(1).T
 
     def memory_parameters(self) -> list[nn.Parameter]:
-        """The lines' mixtures a (L, m) and b (L, m, m); none of one chamber."""
-        return [self.linear, self.bent] if self.chamber is None else []
+        """The lines' mixtures a (L, m) and b (L, m, m); none of one chamber and of the body."""
+        several = self.chamber is None and self.body_rad is None
+        return [self.linear, self.bent] if several else []
+
+    def inputs(self, signal: Tensor) -> Tensor:
+        """Inputs of the play operators: (..., L) from the actuation (..., m); of the body
+        (..., K, 7) from its key points (..., n, 3), mm."""
+        return self.lines(signal) if self.body_rad is None else self.plays.inputs(signal)
 
     @property
     def weights(self) -> Tensor:
@@ -144,16 +176,17 @@ class Hysteresis(Effect):
         return None if self.ring or self.chamber is not None else self.slope
 
     def rest(self, signal: Tensor) -> Tensor:
-        """(B, L, J) play operators centred on the lines at the actuation (B, m): no history."""
-        return self.lines(signal)[..., None].expand(*signal.shape[:-1], -1, len(self.radii))
+        """(B, ..., J) play operators centred on their inputs at the signal (B, ...): no history."""
+        u = self.inputs(signal)
+        return u[..., None].expand(*u.shape, len(self.radii))
 
     def advance(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
-        """(B, L, J) play operators after the actuation (B, m); time does not matter."""
-        return self._follow(memory, self.lines(signal))
+        """(B, ..., J) play operators after the signal (B, ...); time does not matter."""
+        return self._follow(memory, self.inputs(signal))
 
     def step(self, memory: Tensor, signal: Tensor, context: Context) -> tuple[Tensor, Tensor]:
-        """Play operators and effective actuation after the actuation (B, m)."""
-        u = self.lines(signal)
+        """Play operators and the signal behind the effect after the signal (B, ...)."""
+        u = self.inputs(signal)
         memory = self._follow(memory, u)
         return memory, self._superpose(signal, u, memory)
 
@@ -162,16 +195,21 @@ class Hysteresis(Effect):
         return torch.clamp(memory, u - self.radius, u + self.radius)
 
     def scan(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
-        """(R, T, L, J) play operators along the actuation (R, T, m), from (R, L, J) before it."""
-        u = self.lines(signal).unsqueeze(-1)
+        """(R, T, ..., J) play operators along the signal (R, T, ...), from (R, ..., J) before."""
+        u = self.inputs(signal).unsqueeze(-1)
         return play_scan(u.expand(*u.shape[:-1], len(self.radii)), self.radius, memory)
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
-        """Effective actuation (..., m) from actuation (..., m) and play operators (..., L, J)."""
-        return self._superpose(signal, self.lines(signal), memory)
+        """Signal behind the effect, in its shape, from play operators (..., J)."""
+        return self._superpose(signal, self.inputs(signal), memory)
 
     def _superpose(self, signal: Tensor, u: Tensor, memory: Tensor) -> Tensor:
-        lag, slopes = memory - u.unsqueeze(-1), self.slopes
+        lag = memory - u.unsqueeze(-1)
+        if self.body_rad is not None:
+            bend, stretch = lag[..., :-1, :] @ self.bend, lag[..., -1, :] @ self.stretch
+            by_bend, by_stretch = self.plays.moved(signal, bend, stretch)
+            return signal + by_bend + by_stretch
+        slopes = self.slopes
         shift = lag.flatten(-2) @ self.weights.flatten(1).T
         if slopes is not None:
             away = (u - self.lines(self.origin)).unsqueeze(-1)
@@ -179,10 +217,16 @@ class Hysteresis(Effect):
         return signal + self.half_range * shift
 
     def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
-        """(K, ..., m) change of the actuation by each weight: closed form."""
+        """(K, ...) change of the signal by each weight: closed form."""
         with torch.no_grad():
-            u = self.lines(signal)
+            u = self.inputs(signal)
             lag = memory - u.unsqueeze(-1)
+            if self.body_rad is not None:
+                pairs = [
+                    self.plays.moved(signal, each[..., :-1], each[..., -1])
+                    for each in lag.unbind(-1)
+                ]
+                return torch.stack([moved for some in zip(*pairs, strict=True) for moved in some])
             if self.chamber is not None:
                 each = lag[..., self.chamber, :, None] * self.half_range
                 mine = torch.arange(len(self.use), device=lag.device) == self.chamber
@@ -205,10 +249,25 @@ class Hysteresis(Effect):
             "others": self.others,
             "section": self.section,
             "chamber": self.chamber,
+            "body_rad": self.body_rad,
         }
 
     def quantities(self) -> list[Quantity]:
-        """Half loop widths in the arm's unit, the lines' shares and the radii."""
+        """Half loop widths in the arm's unit, the lines' shares and the radii; of the body half
+        loop widths as shares of the bending that is the radius 1."""
+        radii = Quantity(
+            "radius_share", list(self.radii), "", 0.0, 1.0, "Krasnosel'skii 1989, ch. 1"
+        )
+        if self.body_rad is not None:
+            wide = "wide: a loop as wide as the range"
+            loops = [(each.detach() * self.radius).sum() for each in (self.bend, self.stretch)]
+            return [
+                *(
+                    Quantity(f"half_loop_{name}", value_of(loop), "", -1.0, 1.0, wide)
+                    for name, loop in zip(("bend", "stretch"), loops, strict=True)
+                ),
+                radii,
+            ]
         weight = self.weights.detach()
         # A full sweep opens each play by its radius on both sides.
         opened = (weight * self.radius).sum(-1) * self.half_range[:, None]
@@ -218,12 +277,17 @@ class Hysteresis(Effect):
         return [
             Quantity(f"half_loop_{unit}", value_of(opened), unit, -span, span, source),
             Quantity("line_share", value_of(self.linear), "", -3.0, 3.0, "a mixture of shares"),
-            Quantity("radius_share", list(self.radii), "", 0.0, 1.0, "Krasnosel'skii 1989, ch. 1"),
+            radii,
         ]
 
     def readings(self, seconds: float | None = None) -> list[Reading]:
         """Width of the loop of a chamber over its whole range, in the arm's unit: the mean of all
-        that have one."""
+        that have one; of the body its loop in bending, %."""
+        if self.body_rad is not None:
+            loop = 100 * float(self.plays.loop(self.radius) @ self.bend.detach())
+            angle = f"{math.degrees(self.body_rad / 2):.0f}"
+            text = "loop of {} of the range between loading and unloading, where the body bends by "
+            return [Reading(f"{text}{angle} degrees to either side", loop, "%")]
         unit, full = self.facts.unit, torch.diag(self.facts.high - self.facts.low)
         low, middle = self.facts.low.expand(full.shape), self.facts.low + 0.5 * full
         high = self.facts.low + full
@@ -261,33 +325,47 @@ def first_lines(chambers: int) -> Tensor:
 
 
 def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
-    """Candidates for alike chambers; their lines differ in the share of the other chambers."""
+    """Candidates for alike chambers, whose lines differ in the share of the other chambers, and the
+    body's."""
     if len(facts.low) == 1:
-        return [Hysteresis(facts, FEW_RADII, ring=True, pairs=False)]
+        return [Hysteresis(facts, FEW_RADII, ring=True, pairs=False), *_of_body(facts, points)]
     return [*_further(facts, points), Hysteresis(facts, FEW_RADII, True, True, OTHERS[1])]
 
 
 def _further(facts: ArmFacts, points: Tensor) -> list[Effect]:
-    """Lines along single chambers, or of a plane section: loops add up (Kuhnen 2003).
+    """Lines along single chambers, of a plane section, or of the body: loops add up (Kuhnen 2003).
 
     Where there are not three chambers in a ring, one alone may have loops: a tendon of four, a
     chamber of two sections.
     """
-    m = len(facts.low)
+    m, body = len(facts.low), _of_body(facts, points)
     if m == 1:
-        return [Hysteresis(facts, FEW_RADII, True, False)]
+        return [Hysteresis(facts, FEW_RADII, True, False), *body]
     shares = OTHERS[::2] if m in RINGS else OTHERS
     alike: list[Effect] = [Hysteresis(facts, FEW_RADII, True, False, others) for others in shares]
     if m in RINGS:
         alike.append(Hysteresis(facts, FEW_RADII, True, True, SECTION[m], True))
     if m == 3:
-        return alike
-    return [*alike, *(Hysteresis(facts, FEW_RADII, chamber=chamber) for chamber in range(m))]
+        return [*alike, *body]
+    one = [Hysteresis(facts, FEW_RADII, chamber=chamber) for chamber in range(m)]
+    return [*alike, *one, *body]
+
+
+def _of_body(facts: ArmFacts, points: Tensor) -> list[Effect]:
+    """Loops of the strains of the body; none of a body at rest."""
+    hard = dict(most_strained(facts.rest_mm, points)).get("apart")
+    if hard is None:
+        return []
+    return [Hysteresis(facts, FEW_RADII, body_rad=2 * math.sqrt(hard))]
 
 
 def _together(some: list[Effect]) -> list[list[int]]:
-    """All forms of alike chambers side by side; loops of one chamber stand alone."""
-    return [[i for i, each in enumerate(some) if getattr(each, "chamber", None) is None]]
+    """All forms of alike chambers side by side; loops of one chamber and of the body stand
+    alone."""
+    alone = ("chamber", "body_rad")
+    return [
+        [i for i, each in enumerate(some) if all(getattr(each, w, None) is None for w in alone)]
+    ]
 
 
 HYPOTHESIS = Hypothesis(Hysteresis, _grid, _further, _together, needs_reversals=True, memory="path")

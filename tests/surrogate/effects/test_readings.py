@@ -106,6 +106,15 @@ def test_a_body_that_softens_says_how_much_more_it_bends_stretches_and_sags():
     )
 
 
+def test_a_body_that_creeps_says_how_much_more_it_bends_and_stretches():
+    effect = make_effect("creep", FACTS, tau_s=1.0, width=0.1, body=True)
+    words = in_words(with_amplitudes(effect, amount=0.2, stretch=-0.1).readings(300.0))
+    assert words == (
+        "bending under a load held for 300 s +20 %, stretch under a load held for 300 s -10 %, "
+        "half of the creep comes within 0.68 s"
+    )
+
+
 def test_a_body_that_stiffens_says_how_much_less_it_bends_stretches_and_sags():
     stiff = make_effect("stiffening", FACTS, body="whole", full=0.25, weight=True)
     words = in_words(with_amplitudes(stiff, bend=0.2, own=0.1, sag=3.0).readings())

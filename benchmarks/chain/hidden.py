@@ -6,11 +6,13 @@ square); signs and places vary with the robot's seed. The laws, and those of the
 | effect | law here | in the arm model |
 |---|---|---|
 | `payload` | weight at the tip of the chain: a weight coincides | beam, to first order |
-| `hysteresis` | rubber friction of each joint (Berg 1998) | play operators on chambers |
+| `hysteresis` | rubber friction of each joint (Berg 1998) | play operators on chambers or on \
+strains |
 | `gain_mismatch` | two chambers of other areas: proportional, so it coincides | gain |
 | `zero_offset` | two sensors whose zero has shifted, down to no pressure | constant |
 | `line_lag` | isentropic nozzle, discharge by Perry (1949) | tube, root of the difference |
-| `creep` | network that relaxes by a power of its stress (Bergstrom & Boyce 1998) | retarded |
+| `creep` | network that relaxes by a power of its stress (Bergstrom & Boyce 1998) | retarded \
+loads or strains |
 | `misalignment` | rotation and shift of the cameras: coincides | rotation, shift, scale |
 | `rate_dependence` | dashpots of a power of the rate in the joints (Ostwald 1929) | Ellis' fluid |
 | `contact` | a round post with Hertz' (1881) law | one key point and a plane |

@@ -7,11 +7,13 @@ models:
 | effect | law here | in the arm model |
 |---|---|---|
 | `payload` | mass at one side of the tip: a weight coincides | beam, to first order |
-| `hysteresis` | friction of Dahl (1976) in each spring | play operators on chambers |
+| `hysteresis` | friction of Dahl (1976) in each spring | play operators on chambers or on \
+strains |
 | `gain_mismatch` | two regulators out of calibration: a factor coincides | gain |
 | `zero_offset` | two sensors whose zero has shifted, down to no pressure | constant |
 | `line_lag` | long capillaries with volumes between them | one lag, laminar to turbulent |
-| `creep` | retarded elements that stress hurries (Schapery 1969) | retarded, log-normal spectrum |
+| `creep` | retarded elements that stress hurries (Schapery 1969) | retarded loads or strains, \
+log-normal spectrum |
 | `misalignment` | rotation and shift of the cameras: coincides | rotation, shift, scale |
 | `rate_dependence` | fluid of Cross (1965) in series with springs | Ellis' fluid |
 | `contact` | a soft ball that dents the wall, node by node | one key point and a plane |

@@ -8,13 +8,14 @@ models:
 |---|---|---|
 | `payload` | a body on the rim of the tip: a weight coincides | beam, to first order |
 | `hysteresis` | MuJoCo's dry friction in the joints: with its spring each is a play operator \
-of the joint's couple, which coincides in form | play operators on chambers |
+of the joint's couple, which coincides in form | play operators on chambers, or on strains about \
+six axes |
 | `gain_mismatch` | two chambers of other areas: a factor coincides | gain |
 | `zero_offset` | two sensors whose zero has shifted, down to no pressure | constant |
 | `line_lag` | MuJoCo's muscle activation, filling unlike venting (Millard et al. 2013) | one lag, \
 laminar to turbulent |
-| `creep` | a damped joint in series with each joint: linear, so it coincides in form | retarded, \
-log-normal spectrum |
+| `creep` | a damped joint in series with each joint: linear, so it coincides in form | retarded \
+loads or strains, log-normal spectrum |
 | `misalignment` | rotation and shift of the cameras: coincides | rotation, shift, scale |
 | `rate_dependence` | joint damping that grows with the rate: MuJoCo's polynomial | Ellis' fluid |
 | `contact` | a rough ball beside the arm: MuJoCo's contact | one key point and a plane |

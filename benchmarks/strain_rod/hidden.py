@@ -8,13 +8,13 @@ models:
 |---|---|---|
 | `payload` | weight beside the tip: a weight coincides | beam, to first order |
 | `hysteresis` | friction of fibres that pressure presses together (Tondu & Lopez 2000; Wen \
-1976) | play operators on chambers |
+1976) | play operators on chambers or on strains |
 | `gain_mismatch` | two chambers of other areas: proportional, so it coincides | gain |
 | `zero_offset` | two sensors whose zero has shifted, down to no pressure | constant |
 | `line_lag` | turbulent flow in smooth hoses (Blasius 1913) with a volume between | one lag, \
 laminar to turbulent |
-| `creep` | flow by the hyperbolic sine of stress (Garofalo 1965) against a spring | retarded, \
-log-normal spectrum |
+| `creep` | flow by the hyperbolic sine of stress (Garofalo 1965) against a spring | retarded \
+loads or strains, log-normal spectrum |
 | `misalignment` | rotation and shift of the cameras: coincides | rotation, shift, scale |
 | `rate_dependence` | fluid of Powell & Eyring (1944) beside the wall | Ellis' fluid |
 | `contact` | a plate that stiffens exponentially, along the whole body (Winkler 1867) | one key \

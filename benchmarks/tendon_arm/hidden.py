@@ -9,7 +9,8 @@ models:
 | `payload` | a body on the rim of the tip, with its inertia: a weight coincides | beam, to first \
 order |
 | `hysteresis` | bare holes: friction in proportion to the tension and to the angle by which a \
-hole deflects a tendon (Euler 1775), none in a slack one | play operators of one width on chambers |
+hole deflects a tendon (Euler 1775), none in a slack one | play operators of one width on \
+chambers, or on strains |
 | `backlash` | play between the encoder and the drum of two motors: one play operator, which \
 coincides; truth `hysteresis` | play operators |
 | `gain_mismatch` | two drums of other radii: a factor coincides | gain |
@@ -18,7 +19,7 @@ constant |
 | `line_lag` | a drum that follows its encoder late, and no faster than a highest speed | one lag, \
 laminar to turbulent |
 | `creep` | tendons that elongate by a power of their tension, which depends on the posture, too | \
-retarded, log-normal spectrum, of the actuation |
+retarded loads or strains, log-normal spectrum |
 | `misalignment` | rotation and shift of the cameras: coincides | rotation, shift, scale |
 | `rate_dependence` | thickened grease in the holes: a fluid of Carreau (1972), by the speed of \
 each tendon | Ellis' fluid |

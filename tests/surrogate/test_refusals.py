@@ -227,6 +227,8 @@ def test_only_plain_models_are_stepped_by_compiled_code():
     curved = ConstantCurvature(torch.zeros(3), torch.ones(3), 5)
     other = ArmModel(arm.spec, curved, rest_mm=arm.rest_mm)
     assert CompiledStep.of(other) is None
+    rubbing = {"hysteresis": make_effect("hysteresis", arm.facts, body_rad=1.0)}
+    assert CompiledStep.of(arm.replace(effects=rubbing)) is None
 
 
 def test_chains_that_cannot_bend():

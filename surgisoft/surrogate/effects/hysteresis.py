@@ -101,11 +101,16 @@ class Hysteresis(Effect):
         self.register_buffer("origin", facts.rest.clone())
         self.register_buffer("radius", torch.tensor(self.radii))
         self.register_buffer("use", torch.ones(chambers))
+        self.others = float(others) if several else 0.0
+        self.section = bool(section) and several
+        if self.body_rad is not None:
+            self.stage = "body"
+            self.bend, self.stretch = amplitude(len(self.radii)), amplitude(len(self.radii))
+            self.plays = BodyPlays(facts.rest_mm, self.body_rad)
+            return
         lines = first_lines(chambers)
         if not self.pairs:
             lines = lines[:chambers]
-        self.others = float(others) if several else 0.0
-        self.section = bool(section) and several
         if self.section:
             lines = fibre_matrix(torch.tensor(self.others), chambers, ring=True)
             lines = torch.cat([lines[::2], lines[1::2].roll(1, dims=0)])
@@ -115,11 +120,7 @@ class Hysteresis(Effect):
             lines = lines / lines.abs().sum(1, keepdim=True)
         self.linear = nn.Parameter(lines)
         self.bent = nn.Parameter(lines.new_zeros(len(lines), chambers, chambers))
-        if self.body_rad is not None:
-            self.stage = "body"
-            self.bend, self.stretch = amplitude(len(self.radii)), amplitude(len(self.radii))
-            self.plays = BodyPlays(facts.rest_mm, self.body_rad)
-        elif chamber is not None:
+        if chamber is not None:
             self.own = nn.Parameter(torch.zeros(len(self.radii)))
         elif self.ring:
             self.turned = nn.Parameter(torch.zeros(len(lines), len(self.radii)))

@@ -116,8 +116,9 @@ def test_more_of_an_effect_is_its_own_share(problem):
 def test_beside_more_of_an_effect_there_are_loops_of_other_widths(problem):
     """Loops add up, so a model with hysteresis may lack a narrow one; of creep there is no more."""
     made = candidates(problem, ["hysteresis"])
-    assert [candidate.more for candidate in made] == [True, False, False, False]
-    widths = {candidate.effect.others: candidate.effect.radii[0] for candidate in made[1:]}
+    assert [candidate.more for candidate in made] == [True, False, False, False, False]
+    assert [candidate.effect.stage for candidate in made] == ["material"] * 4 + ["body"]
+    widths = {candidate.effect.others: candidate.effect.radii[0] for candidate in made[1:4]}
     assert len(widths) == 3
     assert max(widths.values()) < 0.02
     creep = make_effect("creep", problem.model.facts)

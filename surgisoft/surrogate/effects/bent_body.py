@@ -18,6 +18,8 @@ ENERGIES = ("apart", "whole")
 """Energies of a wall: that of bending and that of stretch, or their sum."""
 HARD = 0.98
 """Quantile over recordings of the mean energy of the nodes at which a body is much strained."""
+STILL_MM = 1e-3
+"""Range of the key points below which a body is at rest, far below the noise of cameras, mm."""
 TINY = 1e-6
 """Length below which a line has no direction, mm."""
 FOLDED = 0.1
@@ -121,7 +123,7 @@ def most_strained(rest_mm: Tensor, points: Tensor) -> list[tuple[str, float]]:
     missing.
     """
     points = points[torch.isfinite(points).all(-1).all(-1)]
-    if len(points) < 2:
+    if len(points) < 2 or float((points.amax(0) - points.amin(0)).max()) < STILL_MM:
         return []
     body = BentBody(rest_mm)
     mean = {each: body.strained(points, each)[..., 0].mean(-1) for each in ENERGIES}

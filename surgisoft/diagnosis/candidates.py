@@ -34,12 +34,11 @@ from torch import Tensor
 from torch.nn import Module, Parameter
 
 from surgisoft.diagnosis.residuals import Problem
-from surgisoft.surrogate.chain import Taps, context_of, memory_at
+from surgisoft.surrogate.chain import Before, Taps, context_of, memory_at
 from surgisoft.surrogate.effects import (
     ArmFacts,
     Context,
     Effect,
-    Stage,
     free_name,
     hypothesis_of,
     known_effects,
@@ -136,8 +135,8 @@ class Signals:
     """Signals behind each stage and memories, every row (R, T, ...)."""
     slope: Tensor
     """(S, n, 3, m) change of key points with the effective actuation, mm a unit."""
-    rest: dict[Stage, Tensor]
-    """The signal of each stage before the first row, (R, m) or (R, n, 3)."""
+    before: Before
+    """The signal of each stage before the first row."""
     first: Tensor
     """(R, m) actuation at which each run begins."""
 
@@ -188,7 +187,7 @@ def sensitivities_of(problem: RowsOfModel, signal: Signals, effect: Effect) -> n
     network's slope; the memory of effects behind them is taken to follow.
     """
     chain, at = problem.model.chain, signal.taps.behind[effect.stage]
-    before = chain.first_memory(effect, signal.rest, at[:, 0], signal.first)
+    before = chain.first_memory(effect, signal.before, at[:, 0], signal.first)
     memory = memory_at(effect, before, at, signal.context, problem.rows, problem.history)
     changes = chain.sensitivities(effect, problem.rows(at), memory, signal.slope)
     return changes.movedim(0, -1).numpy()

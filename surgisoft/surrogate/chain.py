@@ -89,6 +89,17 @@ class Taps:
     `sensor`. An effect that is added to a stage sees it."""
 
 
+class Before(NamedTuple):
+    """Signals behind each stage before the first row of runs: (R, m) for line and material,
+    (R, n, 3) in mm for body and sensor."""
+
+    resting: dict[Stage, Tensor]
+    """Those of the arm at rest."""
+    held: dict[Stage, Tensor]
+    """Those of the arm held at the actuation with which the run begins; behind the material those
+    at rest, because its effects follow from there."""
+
+
 class Resting:
     """Chain mode for an arm without history at a constant actuation."""
 
@@ -148,8 +159,7 @@ class Stepping:
 class Standing(Stepping):
     """Chain mode for arms that came straight from rest and were held for STOOD_S.
 
-    Lags and oscillations in front of and behind the material have died away; the material and a
-    recurrent network have followed for that time.
+    Lags and oscillations have died away; walls and a recurrent network have followed for that time.
     """
 
     def __init__(self, state: ArmState):
@@ -161,9 +171,8 @@ class Standing(Stepping):
         super().__init__(state, Context(held, torch.zeros_like(held)))
 
     def effect(self, link: Link, signal: Signal) -> Tensor:
-        """Signal behind an effect: a material effect has followed, any other has reached steady
-        state."""
-        if link.stage == "material":
+        """Signal behind an effect that has followed (`Effect.follows`) or reached steady state."""
+        if link.part.follows:
             return super().effect(link, signal)
         self.memory[link.name] = link.part.rest(signal.value)
         return link.part.apply(signal.value, self.memory[link.name])
@@ -481,20 +490,17 @@ class Chain:
             return state, None
         return state, Taps(*signal.behind_chambers(), mode.memory, behind)
 
-    def standing(
-        self, pressure: Tensor, signals: bool = True
-    ) -> tuple[ArmState, dict[Stage, Tensor]]:
+    def standing(self, pressure: Tensor, signals: bool = True) -> tuple[ArmState, Before]:
         """Arms before the first row of runs that begin at `pressure` (R, m), and their signals.
 
         An arm that begins away from rest is assumed to have come straight from rest and to have
-        been held for STOOD_S. The signals are those behind each stage, (R, m) for line and
-        material, (R, n, 3) in mm for body and sensor; behind the material that of rest, because an
-        effect that is added there starts from rest too (`first_memory`). Without `signals` these
-        are not asked for, and the network is left out where nothing needs its key points.
+        been held for STOOD_S. Without `signals` these are not asked for, and the network is left
+        out where nothing needs its key points.
         """
         whole = bool(signals or self.outer or self.net.remembers)
         state, taps = self.at_rest(self.rest.expand(len(pressure), -1), whole)
-        seen = taps.behind if taps else {}
+        resting = taps.behind if taps else {}
+        seen = Before(resting, dict(resting))
         away = (pressure != self.rest).any(-1)
         if not away.any():
             return state, seen
@@ -504,21 +510,21 @@ class Chain:
         stages: tuple[Stage, ...] = ("line", "body", "sensor")
         for stage in stages if whole else ():
             wide = away.view(-1, *[1] * (there[stage].ndim - 1))
-            seen[stage] = there[stage].where(wide, seen[stage])
+            seen.held[stage] = there[stage].where(wide, resting[stage])
         stood = ArmState(pressure, mode.anchor, signal.behind_chambers()[1], mode.memory)
         return state.where(away, stood), seen
 
     def first_memory(
-        self, effect: Effect, seen: dict[Stage, Tensor], at_first: Tensor, pressure: Tensor
+        self, effect: Effect, seen: Before, at_first: Tensor, pressure: Tensor
     ) -> Tensor:
         """(R, ...) memory before the first row of an effect added behind the others of its stage.
 
         seen: signals of `standing`; at_first (R, ...): what the effect sees in the first row;
         pressure (R, m): actuation at which each run begins.
         """
-        memory = effect.rest(seen[effect.stage])
+        memory = effect.rest((seen.resting if effect.follows else seen.held)[effect.stage])
         away = (pressure != self.rest).any(-1)
-        if effect.stage != "material" or not away.any():
+        if not effect.follows or not away.any():
             return memory
         time = pressure.new_full((len(pressure),), STOOD_S)
         context = Context(time, None, None, self.chambers(pressure))

@@ -155,11 +155,9 @@ def test_with_one_speed_play_imitates_lag_and_varied_motion_tells_them_apart(arm
 def test_a_schedule_that_stays_at_rest_shows_nothing(arm):
     still = Protocol("still", "continuous", np.zeros((2, 3)), np.zeros(2), np.array([0.0, 120.0]))
     result = isolability(arm, still, ["line_lag", "creep"])
-    # What the arm predicts at rest is a little off its shape at rest, so that its body creeps.
-    assert result.detectable[0] < 1e-3
-    assert result.detectable[1] < 0.3
+    assert result.detectable.max() < 1e-3
     assert not result.seen.any()
-    assert result.pair("line_lag", "creep") == pytest.approx(0.5, abs=0.1)
+    assert result.pair("line_lag", "creep") == pytest.approx(0.5, abs=0.01)
 
 
 def test_longer_and_larger_tells_more(arm, mixed):
@@ -167,9 +165,7 @@ def test_longer_and_larger_tells_more(arm, mixed):
     smaller = isolability(arm, make_protocol("mixed", LIMITS, 6000), NAMES, size_mm=0.1)
     off = ~np.eye(len(NAMES), dtype=bool)
     assert shorter.log_evidence[off].mean() < 0.6 * mixed.log_evidence[off].mean()
-    # Both are near one: equal to a thousandth, while the evidence differs.
-    assert smaller.confidence[off].mean() < mixed.confidence[off].mean() + 1e-3
-    assert smaller.log_evidence[off].mean() < mixed.log_evidence[off].mean()
+    assert smaller.confidence[off].mean() < mixed.confidence[off].mean()
     assert mixed.minutes == pytest.approx(5.0, abs=0.1)
 
 

@@ -90,9 +90,9 @@ def test_the_state_before_the_first_row_is_the_one_that_its_taps_belong_to(names
     held = chain.walk(
         start, _Held(state), chain.links[: len(chain.inner) - len(arm.stage("material"))]
     )
-    assert torch.equal(held.value, seen["line"])
+    assert torch.equal(held.value, seen.held["line"])
     points = chain.walk(start, _Held(state), chain.links).value
-    assert torch.allclose(points, seen["sensor"], atol=1e-4)
+    assert torch.allclose(points, seen.held["sensor"], atol=1e-4)
 
 
 class _Held(Holding):

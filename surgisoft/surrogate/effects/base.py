@@ -131,6 +131,16 @@ class Effect(nn.Module, ABC):
     version: int = 1
     """Version of `config` and of the parameters' meaning, stored in a model's file."""
 
+    @property
+    def follows(self) -> bool:
+        """Whether the memory of an arm that stands away from rest has followed from rest.
+
+        A run may begin away from rest, where the arm has been held for a while. A wall has then
+        followed its load for that time. Any other effect, such as a lag of the line or an
+        oscillation of the body, has reached steady state.
+        """
+        return self.stage == "material"
+
     def __init_subclass__(cls, **more):
         super().__init_subclass__(**more)
         for old, new in OLD_NAMES.items():

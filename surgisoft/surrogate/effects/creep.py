@@ -16,7 +16,8 @@ node j of the body (`bent_body`), and the solid is linear (Boltzmann 1874):
 
     b_j -> b_j + amount sum_k w_k z_k(b_j),    e_j -> e_j + stretch sum_k w_k z_k(e_j).
 
-At rest nothing is added: an arm that has hung for long enough has crept under its weight.
+Strains count from those that the model predicts at rest, which are a little off its shape at rest:
+an arm that has hung for long enough has crept under its weight, and rests.
 
 Under a constant pressure or force the wall gives way further: the amount is positive. Under a
 constant displacement, such as the pull of a tendon in mm, the wall and the tendon relax and the arm
@@ -108,6 +109,11 @@ class Creep(Effect):
         return [] if self.body else [self.log_power]
 
     @property
+    def follows(self) -> bool:
+        """True: a wall, of loads or of the body."""
+        return True
+
+    @property
     def spectrum(self) -> Tensor:
         """(K,) share of each retardation time."""
         distance = (self.times.log() - self.log_tau) / self.log_width.exp()
@@ -126,30 +132,42 @@ class Creep(Effect):
         return x * (x.square() + SMALL**2).pow((self.log_power.exp() - 1) / 2)
 
     def rest(self, signal: Tensor) -> Tensor:
-        """(B, ..., K) elements that have not crept yet, as after a long time at no load."""
+        """(B, ..., K) elements that have not crept yet, as after a long time at no load.
+
+        Of the body (B, ..., K + 1), the last being the pull at rest, from which strains count.
+        """
         pull = self.pull(signal)
-        return pull.new_zeros(*pull.shape, len(self.times))
+        elements = pull.new_zeros(*pull.shape, len(self.times))
+        return torch.cat([elements, pull.unsqueeze(-1)], dim=-1) if self.body else elements
 
     def _keep(self, context: Context, pull: Tensor) -> Tensor:
-        """What the elements keep of their way over a row, broadcast to (..., K) of the pull."""
-        dt = context.dt_s.reshape(*context.dt_s.shape, *[1] * (pull.dim() - context.dt_s.dim() + 1))
+        """What the elements keep of their way over a row, broadcast to (..., K) of a pull
+        (..., 1)."""
+        dt = context.dt_s.reshape(*context.dt_s.shape, *[1] * (pull.dim() - context.dt_s.dim()))
         return torch.exp(-dt / self.times)
 
     def advance(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
         """(B, ..., K) elements after the signal (B, ...)."""
-        pull = self.pull(signal)
+        pull = self.pull(signal).unsqueeze(-1)
         keep = self._keep(context, pull)
-        return keep * memory + (1 - keep) * pull.unsqueeze(-1)
+        if not self.body:
+            return keep * memory + (1 - keep) * pull
+        elements, still = memory[..., :-1], memory[..., -1:]
+        return torch.cat([keep * elements + (1 - keep) * (pull - still), still], dim=-1)
 
     def scan(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
         """(R, T, ..., K) elements along the signal (R, T, ...)."""
-        pull = self.pull(signal)
+        pull = self.pull(signal).unsqueeze(-1)
         keep = self._keep(context, pull)
-        return linear_scan(keep, (1 - keep) * pull.unsqueeze(-1), memory)
+        if not self.body:
+            return linear_scan(keep, (1 - keep) * pull, memory)
+        elements, still = memory[..., :-1], memory[..., -1:].unsqueeze(1)
+        followed = linear_scan(keep, (1 - keep) * (pull - still), elements)
+        return torch.cat([followed, still.expand(*followed.shape[:-1], 1)], dim=-1)
 
     def _crept(self, signal: Tensor, memory: Tensor) -> tuple[Tensor, ...]:
         """Changes of the signal, in its shape, at each amplitude of one."""
-        retarded = memory @ self.spectrum
+        retarded = memory[..., : len(self.times)] @ self.spectrum
         if self.body:
             bend, stretch = retarded[..., :3], retarded[..., 3] / SLENDERNESS
             return self.bent.bent_further(signal, bend, stretch)

@@ -141,6 +141,11 @@ class Hysteresis(Effect):
             return {"turned": self.turned}
         return {"weight": self.weight, "slope": self.slope}
 
+    @property
+    def follows(self) -> bool:
+        """True: a wall, of loads or of the body."""
+        return True
+
     def use_chambers(self, use: Tensor) -> None:
         """Exclude chambers (m,) with 0 from every line."""
         self.use.copy_(use)

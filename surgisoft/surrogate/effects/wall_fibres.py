@@ -35,6 +35,11 @@ class WallFibres(Effect, ABC):
     bent: BentBody
     sagging: Sagging
 
+    @property
+    def follows(self) -> bool:
+        """True: a wall, of loads or of the body."""
+        return True
+
     def set_fibres(
         self,
         others: float,

@@ -165,7 +165,9 @@ def test_longer_and_larger_tells_more(arm, mixed):
     smaller = isolability(arm, make_protocol("mixed", LIMITS, 6000), NAMES, size_mm=0.1)
     off = ~np.eye(len(NAMES), dtype=bool)
     assert shorter.log_evidence[off].mean() < 0.6 * mixed.log_evidence[off].mean()
-    assert smaller.confidence[off].mean() < mixed.confidence[off].mean()
+    # Their confidences are near one, and a larger creep is also imitated better: no more than 0.003
+    # lies between their means for any size from 0.1 mm on.
+    assert smaller.log_evidence[off].mean() < 0.6 * mixed.log_evidence[off].mean()
     assert mixed.minutes == pytest.approx(5.0, abs=0.1)
 
 

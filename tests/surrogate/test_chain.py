@@ -7,7 +7,7 @@ import torch
 
 from surgisoft.surrogate import chain
 from surgisoft.surrogate.chain import Holding, RepeatedScan, Signal, context_of, memory_at
-from surgisoft.surrogate.effects import STAGES, effect_class, hypothesis_of
+from surgisoft.surrogate.effects import STAGES, effect_class, hypothesis_of, make_effect
 from surgisoft.surrogate.effects.drift import Drift
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import ConstantCurvature
@@ -93,6 +93,26 @@ def test_the_state_before_the_first_row_is_the_one_that_its_taps_belong_to(names
     assert torch.equal(held.value, seen.held["line"])
     points = chain.walk(start, _Held(state), chain.links).value
     assert torch.allclose(points, seen.held["sensor"], atol=1e-4)
+
+
+def test_a_wall_of_the_body_has_followed_where_a_run_begins_away_from_rest(away):
+    """Creep for ten seconds of holding, and the lag of friction; one that is added too."""
+    plain = model(())
+    first = plain.first_pressure(away)
+    before = plain.chain.standing(first)[1]
+    resting, held = before.resting["body"], before.held["body"]
+    creep = make_effect("creep", plain.facts, body=True)
+    followed = plain.replace(effects={"creep": creep}).first_state(first).memory["creep"]
+    strain = creep.pull(held) - creep.pull(resting)
+    assert float(strain[0].abs().max()) > 0.1
+    expected = strain.unsqueeze(-1) * -torch.expm1(-10.0 / creep.times)
+    assert torch.allclose(followed[..., :-1], expected, atol=1e-6)
+    assert torch.equal(plain.chain.first_memory(creep, before, held, first), followed)
+    rubbing = make_effect("hysteresis", plain.facts, radii=(0.01,), body_rad=1.0)
+    plays = plain.replace(effects={"hysteresis": rubbing}).first_state(first).memory["hysteresis"]
+    inputs = rubbing.inputs(held), rubbing.inputs(resting)
+    lagging = torch.maximum(inputs[0] - 0.01, torch.minimum(inputs[0] + 0.01, inputs[1]))
+    assert torch.allclose(plays[..., 0], lagging, atol=1e-6)
 
 
 class _Held(Holding):

@@ -11,7 +11,7 @@ is its `Hypothesis` (`surgisoft.surrogate.effects.hypothesis`).
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -130,6 +130,12 @@ class Effect(nn.Module, ABC):
     """Place in the chain at which the effect acts."""
     version: int = 1
     """Version of `config` and of the parameters' meaning, stored in a model's file."""
+
+    def with_changes(self, signal: Tensor, changes: Iterable[Tensor]) -> Tensor:
+        """The signal with the change at an amplitude of one for each of `amplitudes`, all (1,)."""
+        for size, change in zip(self.amplitudes().values(), changes, strict=True):
+            signal = signal + size * change
+        return signal
 
     @property
     def follows(self) -> bool:

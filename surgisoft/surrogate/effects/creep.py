@@ -175,11 +175,7 @@ class Creep(Effect):
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
         """Signal behind the effect, in its shape, from the elements (..., K)."""
-        for size, change in zip(
-            self.amplitudes().values(), self._crept(signal, memory), strict=True
-        ):
-            signal = signal + size * change
-        return signal
+        return self.with_changes(signal, self._crept(signal, memory))
 
     def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
         """(1, ...), of the body (2, ...), change of the signal by each amplitude: closed form."""

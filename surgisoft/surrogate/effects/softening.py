@@ -55,9 +55,9 @@ GRID = ((0.05, 0.02), (0.2, 0.02), (0.8, 0.02), (0.02, 0.2), (0.02, 0.7))
 DAMAGE_GRID = (0.1, 1.0)
 """Widths of damage that identification tries, in units of the energy at full load."""
 BODY_GRID = ((0.05, True), (1.0, True), (0.01, False), (0.1, False))
-"""Widths that identification tries of the body, in units of that of a body that is
-much strained, and whether the
-wall is damaged: a softening below the largest strain is over within a small part of it."""
+"""Widths that identification tries of the body, in units of the energy of a body that is much
+strained, and whether the wall is damaged: a softening below the largest strain is over within a
+small part of it."""
 OTHERS = -0.35
 """Share of the other chambers in a wall fibre's load that identification tries."""
 
@@ -166,10 +166,7 @@ class Softening(WallFibres):
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
         """Signal behind the effect, in its shape, from largest energies (..., ...)."""
-        changes = self._softened(signal, memory)
-        for size, change in zip(self.amplitudes().values(), changes, strict=True):
-            signal = signal + size * change
-        return signal
+        return self.with_changes(signal, self._softened(signal, memory))
 
     def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
         """(2, ...), with a weight (3, ...), change of the signal by each amplitude: closed form."""

@@ -124,10 +124,7 @@ class Stiffening(WallFibres, Memoryless):
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
         """The signal behind the effect, in its shape."""
-        changes = self._lost(signal)
-        for size, change in zip(self.amplitudes().values(), changes, strict=True):
-            signal = signal + size * change
-        return signal
+        return self.with_changes(signal, self._lost(signal))
 
     def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
         """(2, ...), with a weight (3, ...), change of the signal by each amplitude: closed form."""

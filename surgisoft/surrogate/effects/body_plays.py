@@ -8,7 +8,8 @@ and y[u] the play operator's answer to u,
     lag of b = (3 / A) sum_a n_a (y[n_a . b] - n_a . b),      lag of e = y[e] - e.
 
 The A = 6 axes are those through the vertices of an icosahedron, for which (3 / A) sum_a n_a n_a' is
-the unit matrix and no direction is preferred.
+the unit matrix: while no play operator slips, all directions are alike. Where all of them slip, the
+lag along the bending is 1.38 to 1.62 radii.
 """
 
 import math

@@ -173,7 +173,10 @@ def test_an_effect_that_is_plausible_only_beside_another_is_ranked():
     from surgisoft.diagnosis.selection import find
 
     problem = problem_of(default_arm(), [recorded("creep")], part="training")
-    found = find(problem, candidates(problem, ["creep", "misalignment"]), lambda text: None)
+    # Creep of the loads alone: it has one amplitude, that of the body has two.
+    tried = candidates(problem, ["creep", "misalignment"])
+    tried = [one for one in tried if (one.name, one.effect.stage) != ("creep", "body")]
+    found = find(problem, tried, lambda text: None)
     second = next(s for s in found.first if s.effect == "misalignment")
     first = [s for s in found.first if s.effect != "misalignment"]
     pair = replace(found.proposals[0], scores=(first[0], second))

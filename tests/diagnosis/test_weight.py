@@ -67,12 +67,14 @@ def test_own_weight_of_a_rolled_arm_is_called_a_load(arm, turned, tmp_path):
     """Truth: nothing but gravity's direction differs from where the model was fitted."""
     model, _ = under_weight(arm, [turned])
     found = diagnose(model, [turned])
-    assert found.ranking[0].effect == "payload"
-    # Nothing is named besides it: at most as what these recordings do not tell from it.
-    assert found.verdict.kind != "several"
-    assert found.verdict.effects[:1] in ((), ("payload",))
+    # Of all effects the load leaves least. At most one other is named that these recordings do not
+    # tell from it: a load that changes little with the posture does what shifted zeros do.
+    load = next(row for row in found.ranking if row.effect == "payload")
+    assert load.heldout_rmse_mm == min(row.heldout_rmse_mm for row in found.ranking)
+    assert found.verdict.kind in ("identified", "ambiguous")
+    assert "payload" in found.verdict.effects
     if found.verdict.kind == "ambiguous":
-        assert f"{found.ranking[0].heldout_rmse_mm:.3g} mm" in found.verdict.sentence
+        assert f"payload {load.heldout_rmse_mm:.3g} mm" in found.verdict.sentence
     result = amend(model, [turned], ["payload"])
     assert result.held_out.after < 0.25 * result.held_out.before
     save_model(result.model, tmp_path / "turned", {})

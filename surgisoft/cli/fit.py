@@ -101,7 +101,8 @@ def fit(
         typer.Option(help="Which actuation is the model's input."),
     ] = ACTUATION,
     epochs: Annotated[
-        int, typer.Option(min=1, help="Largest number of epochs of a stage; at least 10.")
+        int,
+        typer.Option(min=1, help="Largest number of epochs of a stage; fewer than 10 count as 10."),
     ] = EPOCHS,
     seed: Annotated[
         int,

@@ -60,7 +60,7 @@ def next_experiment(
         float, typer.Option(metavar="MIN", help="Longest duration of the experiment, minutes.")
     ] = 15.0,
     as_it_stands: Annotated[
-        bool, typer.Option("--as-it-stands", help="Propose no change of the experimental setup.")
+        bool, typer.Option("--as-it-stands", help="Propose no change of the experimental set-up.")
     ] = False,
     before: Before = None,
     paired: Paired = "auto",
@@ -221,7 +221,7 @@ def _record(result, rig: str, schedule: Path, record: Path, force: bool) -> None
         raise InputError(
             f"{schedule} is written, {record} is not: first {result.steps[0]}; then "
             f"'{command}' (--as-it-stands proposes no "
-            "change of the experimental setup)"
+            "change of the experimental set-up)"
         )
     try:
         recording, log = record_on(schedule, rig, record, force, **setup)

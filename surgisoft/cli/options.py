@@ -51,7 +51,7 @@ ModelError = Annotated[
         metavar="MM",
         help="Validated RMS error of a key point, mm, of a callable model or of predictions. "
         "Of several models in `compare`, it is that of the one callable among them. Default: the "
-        "error that the callable states, else its error on --before.",
+        "error that the callable states, else its error on --before, else 5 % of the arm's length.",
     ),
 ]
 Recordings = Annotated[

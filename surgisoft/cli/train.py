@@ -138,7 +138,11 @@ def train(
         ),
     ] = None,
     steps: Annotated[
-        int | None, typer.Option(min=1, help="Steps over all episodes; default: by the task.")
+        int | None,
+        typer.Option(
+            min=1,
+            help="Steps over all episodes; default: by the task; --preset paper: 20,000,000.",
+        ),
     ] = None,
     minutes: Annotated[
         float | None,

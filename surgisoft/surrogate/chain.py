@@ -205,6 +205,7 @@ class Scanning:
         direction: Tensor | None = None,
         history: History | None = None,
         keeps: bool = True,
+        known: Mapping[str, Tensor] | None = None,
     ):
         """Set where the scan starts and which rows it computes.
 
@@ -213,9 +214,11 @@ class Scanning:
         effects behind it compute, which must then have no memory (None: every row); direction: (R,
         T, m) direction of change where it is known, as in a window of a longer scan; history: the
         runs that are scanned, which networks of whole runs need; keeps: whether memories are kept
-        where there are very many rows and all are asked for.
+        where there are very many rows and all are asked for; known: memory (R, T, ...) of effects
+        that need not be followed, because they saw the same signal before.
         """
         self.history, self.keeps, self.groups = history, keeps, None
+        self.known = known or {}
         if history is not None and _mostly_padding(history):
             self.groups = history.groups
         self.start, self.context, self.rows, self.given = start, context, rows, direction
@@ -254,8 +257,10 @@ class Scanning:
             if whole is not None:
                 self.memory[link.name] = whole
             return answer
-        self.memory[link.name] = memory_along(part, start, value, context)
-        return part.apply(value, self.memory[link.name])
+        known = self.known.get(link.name)
+        memory = memory_along(part, start, value, context) if known is None else known
+        self.memory[link.name] = memory
+        return part.apply(value, memory)
 
     def network(self, link: Link, signal: Signal) -> Tensor:
         """(R, T, n, 3), or (S, n, 3), key points in mm."""
@@ -647,9 +652,10 @@ class Chain:
 class RepeatedScan:
     """Prediction (S, n, 3) in mm, by calling, while parameters of some effects change.
 
-    Links in front of the first one that may change are computed once. Memories follow every row;
-    the network, and effects behind it unless one of them has memory, compute the requested rows
-    alone. Autograd runs through parameters that require it.
+    Links in front of the first one that may change are computed once, and so is its memory as long
+    as the parameters stay equal that this depends on. Memories follow every row; the network, and
+    effects behind it unless one of them has memory, compute the requested rows alone. Autograd runs
+    through parameters that require it.
     """
 
     def __init__(
@@ -674,24 +680,87 @@ class RepeatedScan:
         wanted = keys or {NETWORK}
         place = next(i for i, link in enumerate(chain.links) if link.name in wanted)
         self.links = chain.links[place:]
+        self.context = context_of(history)
+        self.followed: Followed | None = None
         with torch.no_grad():
-            self.start = self._walk(Signal(history.pressure), chain.links[:place])
+            front = chain.links[:place]
+            self.start = chain.walk(Signal(history.pressure), self._mode(), front)
 
     def __call__(self) -> Tensor:
         """(S, n, 3) key points in mm, base frame."""
-        points = self._walk(self.start, self.links).value
+        points = self._walked()[1].value
         return points if self.thin else self.rows(points)
 
-    def mode(self) -> Scanning:
+    @torch.no_grad()
+    def first_memory(self) -> Tensor:
+        """(S, ...) memory of the first effect that changes, on the requested rows."""
+        effect, signal = self.links[0].part, self.start
+        if self.thin and effect.stage in ("body", "sensor"):  # its signal has these rows alone
+            return signal.value[..., :0, 0]
+        followed = self._still_followed()
+        if followed is not None:
+            return self.rows(followed.memory)
+        return self.rows(self._walked(self.links[:1])[0].memory[self.links[0].name])
+
+    def _mode(self) -> Scanning:
         """A scan from the memories before the first row, for the present parameters."""
+        rows, followed = self.rows if self.thin else None, self._still_followed()
+        if followed is not None and self._nothing_follows_behind():
+            start, known = followed.start, {self.links[0].name: followed.memory}
+            return Scanning(start, self.context, rows, history=self.history, known=known)
         runs = self.history.runs
         start = self.chain.standing(self.first, signals=False)[0].memory
         start = {name: memory.expand(runs, *memory.shape[1:]) for name, memory in start.items()}
-        rows = self.rows if self.thin else None
-        return Scanning(start, context_of(self.history), rows, history=self.history)
+        known = {} if followed is None else {self.links[0].name: followed.memory}
+        return Scanning(start, self.context, rows, history=self.history, known=known)
 
-    def _walk(self, signal: Signal, links: tuple[Link, ...]) -> Signal:
-        return self.chain.walk(signal, self.mode(), links)
+    def _walked(self, links: tuple[Link, ...] | None = None) -> tuple[Scanning, Signal]:
+        """The scan and the signal behind links (default: all from the first that changes)."""
+        mode = self._mode()
+        signal = self.chain.walk(self.start, mode, self.links if links is None else links)
+        self._keep(mode)
+        return mode, signal
+
+    def _on(self) -> list[Tensor] | None:
+        """Parameters that the memory of the first link depends on; None where none can be kept."""
+        part = self.links[0].part
+        if not isinstance(part, Effect) or isinstance(part, Memoryless):
+            return None
+        on = [parameter.detach() for parameter in part.memory_parameters()]
+        return None if on and torch.is_grad_enabled() else on
+
+    def _keep(self, mode: Scanning) -> None:
+        """Keep the memory of the first link, where it was followed at once."""
+        on, memory = self._on(), mode.memory.get(self.links[0].name)
+        if on is None or memory is None or memory.requires_grad or _very_many(self.start.value):
+            return
+        self.followed = Followed([each.clone() for each in on], memory, mode.start)
+
+    def _still_followed(self) -> "Followed | None":
+        """The memory of the first link that was kept, if its parameters are still the same."""
+        if self.followed is None:
+            return None
+        on, pairs = self._on(), self.followed.on
+        if on is None or not all(map(torch.equal, on, pairs)):
+            return None
+        return self.followed
+
+    def _nothing_follows_behind(self) -> bool:
+        """Whether no link behind the first one has a memory that could begin otherwise."""
+        parts = [link.part for link in self.links[1:]]
+        effects = [part for part in parts if isinstance(part, Effect)]
+        return not self.chain.net.remembers and all(isinstance(e, Memoryless) for e in effects)
+
+
+class Followed(NamedTuple):
+    """The memory of an effect along a history, and what it depends on."""
+
+    on: list[Tensor]
+    """The parameters that it depends on, as they were."""
+    memory: Tensor
+    """(R, T, ...) the memory in every row."""
+    start: dict[str, Tensor]
+    """(R, ...) memory of each effect before the first row."""
 
 
 def context_of(history: History) -> Context:

@@ -288,13 +288,13 @@ def amplitude_sensitivities(model: ArmModel, forward: RepeatedScan, key: str) ->
     taken to follow.
     """
     effect, signal, rows = model.effects[key], forward.start, forward.rows
-    mode = forward.mode()
-    memory = rows(effect.scan(mode.start[key], signal.value, mode.context_at(signal)))
-    slope = None
+    memory, slope = forward.first_memory(), None
     if effect.stage in FRONT:
         taps = model.chain.scan(forward.history, forward.first_pressure, model.chain.inner)
         slope = model.chain.slope(forward.history, forward.first_pressure, taps, rows)
-    changes = model.chain.sensitivities(effect, rows(signal.value), memory, slope)
+    thin = forward.thin and effect.stage not in FRONT
+    at = signal.value if thin else rows(signal.value)
+    changes = model.chain.sensitivities(effect, at, memory, slope)
     return changes.movedim(0, -1).numpy()
 
 

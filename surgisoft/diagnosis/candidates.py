@@ -195,14 +195,20 @@ def sensitivities_of(problem: RowsOfModel, signal: Signals, effect: Effect) -> n
 
 @torch.no_grad()
 def more_of(problem: RowsOfModel, signal: Signals, name: str) -> Candidate | None:
-    """An effect that the model has already, stronger or weaker: one column for each output.
+    """An effect of the wall that the model has already, stronger or weaker.
 
-    For an effect on the actuation one for each chamber too, in turn.
+    For one that acts on the actuation a column for all chambers and one for each, in turn; for one
+    of the body a column of what it changes in the prediction.
     """
-    effect = problem.model.effects[name]
+    effect, chain = problem.model.effects[name], problem.model.chain
+    if type(effect).stage == "material" and effect.stage == "body":
+        some = {key: each for key, each in problem.model.effects.items() if key != name}
+        without = problem.model.replace(effects=some).chain.scan(problem.history, signal.first)
+        change = signal.taps.behind["sensor"] - without.behind["sensor"]
+        column = problem.rows(change).unsqueeze(-1)
+        return Candidate(name, effect, column.double().numpy(), more=True)
     if effect.stage != "material":
         return None
-    chain = problem.model.chain
     if name in signal.taps.memory:
         before, after = chain.around(name, signal.taps)
     else:

@@ -55,7 +55,8 @@ class Search:
 
     def priced(self, log_gain: float, amplitudes: int) -> float:
         """A log gain, the less of it counted the more amplitudes it took."""
-        return float(log_gain) * (1.0 - self.amplitude_price * min(amplitudes, self.most_priced))
+        price = self.amplitude_price * min(amplitudes, self.most_priced)
+        return float(log_gain) - price * abs(float(log_gain))
 
 
 @dataclass(frozen=True)

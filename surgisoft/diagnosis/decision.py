@@ -983,7 +983,8 @@ def chosen(
     tried = statements(evidence, chances, worth, claim)
     best = next((one for one in tried if one.probability >= worth.least_probability), None)
     if best is None or best.worth <= 0.0:
-        most = max(one.probability for one in tried)
+        silent = max(chances.nothing, chances.network, chances.unknown)
+        most = max((one.probability for one in tried), default=silent)
         return Decision("cannot_tell", (), most, chances, reason_of(evidence, chances), tried)
     reason = _why_off(evidence, claim) if best.kind == "surrogate_undertrained" else None
     return Decision(best.kind, best.effects, best.probability, chances, reason, tried)

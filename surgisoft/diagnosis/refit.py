@@ -733,12 +733,13 @@ def check_trainable(model: ArmModel, effects: Iterable[str] = ()) -> None:
 def starting_model(problem: Problem, effects: Iterable[str]) -> ArmModel:
     """The problem's model with effects at their first-order estimates, as far as plausible.
 
-    Effects that the model has already stay as they are.
+    Effects that the model has already stay as they are. Only forms that act in front of the network
+    are trained together with it; those of the body change its key points.
     """
     model = problem.model
     for name in effects:
         if name not in model.effects:
-            model = starts(problem.with_model(model), name, 1)[0]
+            model = starts(problem.with_model(model), name, 1, stages=FRONT)[0]
             _hold_plausible(model, [name])
     return model
 

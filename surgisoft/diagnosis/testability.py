@@ -63,8 +63,10 @@ def testable(
     kept: list[Candidate] = []
     left_out = []
     kinds, static = known_effects(), _Static(problem)
+    slope = has_slope(problem.model)
     for name in names:
-        own = [candidate for candidate in some if candidate.name == name]
+        own = [one for one in some if one.name == name]
+        own = [one for one in own if slope or one.effect.stage not in FRONT]
         cause = _cause(problem, kinds[name], own, static)
         if cause is None:
             kept += own
@@ -90,7 +92,7 @@ def _cause(
 ) -> Cause | None:
     """Why an effect cannot show; None where it can."""
     hypothesis = hypothesis_of(kind)
-    if kind.stage in FRONT and not has_slope(problem.model):
+    if not own and kind.stage in FRONT and not has_slope(problem.model):
         return "no_slope"
     if hypothesis.needs_motion and not problem.table.timed[problem.index.numpy()].any():
         return "no_motion"

@@ -2,7 +2,7 @@
 
 import copy
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -29,7 +29,7 @@ from surgisoft.diagnosis.estimation.least_squares import (
 from surgisoft.diagnosis.estimation.network_error import NetworkError
 from surgisoft.diagnosis.residuals import Problem
 from surgisoft.errors import InputError
-from surgisoft.surrogate.effects import Effect, free_name
+from surgisoft.surrogate.effects import STAGES, Effect, free_name
 from surgisoft.surrogate.model import ArmModel
 
 LARGE = 24
@@ -300,7 +300,11 @@ def _added(problem: Problem, name: str, beside: Sequence[str] = ()) -> list[ArmM
 
 
 def starts(
-    problem: Problem, name: str, number: int = 2, every_form: bool = False
+    problem: Problem,
+    name: str,
+    number: int = 2,
+    every_form: bool = False,
+    stages: Container[str] = STAGES,
 ) -> list[ArmModel]:
     """Models with the named effect in its best few candidates, amplitudes fitted; parts are copies.
 
@@ -309,9 +313,16 @@ def starts(
     The candidates are ranked by the error that each leaves on held-out blocks beside the model
     discrepancy; of two that leave nearly the same, the simpler one comes first.
 
-    every_form: whether the best candidate of each other form (`Effect.config`) is a start, too.
+    every_form: whether the best candidate of each other form (`Effect.config`) is a start, too;
+    stages: those at which the effect may act: a form of the body acts behind the network.
     """
-    tried = [each for each in model_candidates(problem, [name]) if not each.more]
+    every = [each for each in model_candidates(problem, [name]) if not each.more]
+    tried = [each for each in every if each.effect.stage in stages]
+    if every and not tried:
+        raise InputError(
+            f"only forms of '{name}' that act behind the network change anything on these "
+            "recordings, and none of them is fitted together with it; pass --refit never"
+        )
     if not tried:
         raise InputError(
             f"effect '{name}' changes nothing on these recordings, so nothing of it can be fitted; "

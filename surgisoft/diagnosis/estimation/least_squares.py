@@ -201,7 +201,8 @@ class Prediction:
             size = float(np.sqrt(np.square(change).sum(-1).mean()))
             if step and OPTIONS.least_change_mm <= size <= OPTIONS.largest_change_mm:
                 break
-            factor = float(np.clip(OPTIONS.wanted_change_mm / max(size, 1e-9), 1e-2, 30.0))
+            wanted = OPTIONS.wanted_change_mm / max(size, 1e-9) if np.isfinite(size) else 0.0
+            factor = float(np.clip(wanted, 1e-2, 30.0))
             if factor > 1 and self.steps[i] >= longest:
                 break
             self.steps[i] = min(self.steps[i] * factor, longest)

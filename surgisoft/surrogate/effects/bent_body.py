@@ -18,13 +18,16 @@ ENERGIES = ("apart", "whole")
 """Energies of a wall: that of bending and that of stretch, or their sum."""
 HARD = 0.98
 """Quantile over recordings of the mean energy of the nodes at which a body is much strained."""
+LEAST_ENERGY = 1e-3
+"""Share of one energy, of bending or of stretch, that the other one is at least taken to be where
+it scales a law: a fiftieth of the strain or less is none that a wall stiffens by [-]."""
 STILL_MM = 1e-3
 """Range of the key points below which a body is at rest, far below the noise of cameras, mm."""
 TINY = 1e-6
 """Length below which a line has no direction, mm."""
 FOLDED = 0.1
-"""One plus the cosine of an angle between lines below which a body that is folded back bends no
-more [-]."""
+"""Least value of one plus the cosine of the angle between two lines that their bending is divided
+by, so that it stays finite where a body is folded back [-]."""
 
 
 class BentBody(nn.Module):
@@ -122,10 +125,36 @@ def most_strained(rest_mm: Tensor, points: Tensor) -> list[tuple[str, float]]:
     rest_mm: (n, 3) key points at rest, mm; points: (S, n, 3) those of recordings, mm, NaN where
     missing.
     """
-    points = points[torch.isfinite(points).all(-1).all(-1)]
-    if len(points) < 2 or float((points.amax(0) - points.amin(0)).max()) < STILL_MM:
+    points = _moving(points)
+    if not len(points):
         return []
     body = BentBody(rest_mm)
     mean = {each: body.strained(points, each)[..., 0].mean(-1) for each in ENERGIES}
     hard = {each: float(energy.quantile(HARD)) for each, energy in mean.items()}
     return [(each, energy) for each, energy in hard.items() if energy > 0.0]
+
+
+def hardest_strained(rest_mm: Tensor, points: Tensor) -> list[tuple[str, tuple[float, float]]]:
+    """(one of ENERGIES, its values in rad^2) of the most strained node: of bending, of stretch.
+
+    As `most_strained`. A strain of next to no energy counts as LEAST_ENERGY of the other one.
+    """
+    points = _moving(points)
+    if not len(points):
+        return []
+    body = BentBody(rest_mm)
+    answer = []
+    for each in ENERGIES:
+        bend, stretch = body.strained(points, each).amax(-2).quantile(HARD, dim=0).tolist()
+        least = LEAST_ENERGY * max(bend, stretch)
+        if least > 0.0:
+            answer.append((each, (max(bend, least), max(stretch, least))))
+    return answer
+
+
+def _moving(points: Tensor) -> Tensor:
+    """The rows of key points (S, n, 3), mm, that are whole; none of a body that does not move."""
+    points = points[torch.isfinite(points).all(-1).all(-1)]
+    if len(points) < 2 or float((points.amax(0) - points.amin(0)).max()) < STILL_MM:
+        return points[:0]
+    return points

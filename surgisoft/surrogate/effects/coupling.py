@@ -82,8 +82,7 @@ class Coupling(Memoryless):
             spread = beside(m).unsqueeze(0)
         else:
             self.product = amplitude(1)
-            turned = {"next": -1, "previous": 1}
-            spread = 1 - torch.eye(m) if who == "all" else torch.eye(m).roll(turned[who], 0)
+            spread = 1 - torch.eye(m) if who == "all" else _neighbour(m, who)
             spread = spread.unsqueeze(0)
         self.register_buffer("spread", spread, persistent=False)
 
@@ -174,11 +173,22 @@ def beside(chambers: int) -> Tensor:
     Three chambers, or each three in turn where their number is a multiple of SEGMENT, are a ring,
     as is any other number.
     """
-    ring = SEGMENT if chambers % SEGMENT == 0 else chambers
-    number = torch.arange(chambers)
+    ring, number = _ring(chambers), torch.arange(chambers)
     apart = (number[:, None] - number[None, :]).abs() % ring
     one = number[:, None] // ring == number[None, :] // ring
     return (one & ((apart == 1) | (apart == ring - 1))).float()
+
+
+def _ring(chambers: int) -> int:
+    """Number of chambers in the ring of a segment."""
+    return SEGMENT if chambers % SEGMENT == 0 else chambers
+
+
+def _neighbour(chambers: int, who: str) -> Tensor:
+    """(m, m) one where the second chamber is the `next` or `previous` one in the ring."""
+    ring, number = _ring(chambers), torch.arange(chambers)
+    turned = (number + (1 if who == "next" else -1)) % ring
+    return torch.eye(chambers)[number // ring * ring + turned]
 
 
 def _yielded(load: Tensor, walls: Tensor, power: float) -> Tensor:

@@ -118,8 +118,12 @@ class Hysteresis(Effect):
         elif self.others:
             lines = lines + self.others * (lines.sum(1, keepdim=True) - lines)
             lines = lines / lines.abs().sum(1, keepdim=True)
-        self.linear = nn.Parameter(lines)
-        self.bent = nn.Parameter(lines.new_zeros(len(lines), chambers, chambers))
+        bent = lines.new_zeros(len(lines), chambers, chambers)
+        if chamber is not None:  # along its own actuation alone: no mixture to fit
+            self.register_buffer("linear", lines)
+            self.register_buffer("bent", bent)
+        else:
+            self.linear, self.bent = nn.Parameter(lines), nn.Parameter(bent)
         if chamber is not None:
             self.own = nn.Parameter(torch.zeros(len(self.radii)))
         elif self.ring:

@@ -183,14 +183,20 @@ class Softening(WallFibres):
         if self.body is not None:
             return self._of_body()
         rubber = "wide: at most twice the push; a wall does not heal by load (Mullins 1969)"
-        total = float((self.own + self.common).detach())
-        own, common = ("bend", "stretch") if self.section else ("own", "common")
-        quantities = [
-            Quantity(f"{own}_share", value_of(self.own), "", -0.5, 1.0, rubber),
-            Quantity(f"{common}_share", value_of(self.common), "", -0.5, 1.0, rubber),
-            Quantity("total_share", total, "", 0.0, 1.0, rubber),
-            Quantity("width_share", value_of(self.log_width.exp()), "", 0.001, 5.0, rubber),
-        ]
+        if self.section:  # each share is that of a strain of its own
+            quantities = [
+                Quantity("bend_share", value_of(self.own), "", -0.1, 1.0, rubber),
+                Quantity("stretch_share", value_of(self.common), "", -0.1, 1.0, rubber),
+            ]
+        else:
+            total = float((self.own + self.common).detach())
+            quantities = [
+                Quantity("own_share", value_of(self.own), "", -0.5, 1.0, rubber),
+                Quantity("common_share", value_of(self.common), "", -0.5, 1.0, rubber),
+                Quantity("total_share", total, "", 0.0, 1.0, rubber),
+            ]
+        width = Quantity("width_share", value_of(self.log_width.exp()), "", 0.001, 5.0, rubber)
+        quantities.append(width)
         if not self.damage:
             growth = value_of(self.log_growth.exp())
             quantities.append(Quantity("growth_share", growth, "", 1e-4, 5.0, rubber))

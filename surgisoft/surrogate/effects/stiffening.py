@@ -27,10 +27,14 @@ where gravity is known,
     b_k -> b_k (1 - bend h(W / full)),    e_k -> e_k (1 - own h(W / full)),
     q = p - sag mean_k h(W / full) u(p).
 
-`full` is an energy at which the arm is much strained, so that amplitudes are losses there.
+`full` is the energy of the most strained node where the arm is much strained, that of bending and
+that of stretch each for itself, so that amplitudes are losses there. Beyond it, and beyond the
+energy at full load, h goes on along its tangent: a recording beyond the range of the fit must not
+blow up.
 """
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -45,7 +49,7 @@ from surgisoft.surrogate.effects.base import (
     logarithm,
     value_of,
 )
-from surgisoft.surrogate.effects.bent_body import SLENDERNESS, most_strained
+from surgisoft.surrogate.effects.bent_body import SLENDERNESS, hardest_strained
 from surgisoft.surrogate.effects.hypothesis import Hypothesis, no_combinations
 from surgisoft.surrogate.effects.readings import Reading
 from surgisoft.surrogate.effects.wall_fibres import WallFibres, bend_and_stretch, walls_tried
@@ -54,9 +58,6 @@ GRID = (0.1, 2.0, 5.0)
 """Steepnesses k that identification tries: nearly cubic, and exponential."""
 BODY_GRID = (0.1, 3.0)
 """Steepnesses that identification tries of the body."""
-MOST = 4.0
-"""Energy, in units of that of the exponential, up to which it grows [-]: a recording beyond the
-fitted range must not blow up."""
 OTHERS = -0.35
 """Share of the other chambers in a wall fibre's load that identification tries."""
 
@@ -65,6 +66,7 @@ class Stiffening(WallFibres, Memoryless):
     """Progressive loss of push, equal for all chambers, or of strain along the body."""
 
     stage: Stage = "material"
+    energy_at_full: Tensor
 
     def __init__(
         self,
@@ -74,19 +76,21 @@ class Stiffening(WallFibres, Memoryless):
         ring: bool = False,
         section: bool = False,
         body: str | None = None,
-        full: float = 1.0,
+        full: float | Sequence[float] = 1.0,
         weight: bool = False,
     ):
         """steepness: k of the exponential; towards 0 a cubic spring.
 
         others, ring: the mixture of the wall fibres' loads (`fibre_matrix`); section: bending and
         stretch of the section in their place; body: one of ENERGIES, for the strains of the body in
-        place of loads; full: energy of the body at which it loses the shares that the amplitudes
-        say, rad^2; weight: whether the body also sags less by its own weight, whose direction must
-        then be known.
+        place of loads; full: energies of the body, of bending and of stretch, at which it loses the
+        shares that the amplitudes say, rad^2 (a number: the same for both); weight: whether the
+        body also sags less by its own weight, whose direction must then be known.
         """
         super().__init__(facts)
-        self.full = float(full)
+        both = (full, full) if isinstance(full, (int, float)) else full
+        self.full = tuple(float(each) for each in both)
+        self.register_buffer("energy_at_full", torch.tensor(self.full), persistent=False)
         self.own = amplitude(1)
         self.bend = amplitude(1)
         self.log_steepness = logarithm(steepness)
@@ -100,12 +104,13 @@ class Stiffening(WallFibres, Memoryless):
     def _share(self, energy: Tensor) -> Tensor:
         """Share of the loss at full load, at an energy over that at full load."""
         k = self.log_steepness.exp()
-        return torch.expm1(k * energy.clamp(max=MOST)) / torch.expm1(k)
+        inside = torch.expm1(k * energy.clamp(max=1.0)) / torch.expm1(k)
+        return inside - k / torch.expm1(-k) * (energy - 1.0).clamp(min=0.0)
 
     def _lost(self, signal: Tensor) -> tuple[Tensor, ...]:
         """Changes of the signal, in its shape, at each amplitude of one."""
         if self.body is not None:
-            less = -self._share(self.bent.strained(signal, self.body) / self.full)
+            less = -self._share(self.bent.strained(signal, self.body) / self.energy_at_full)
             by_bend, by_stretch, *by_sag = self.body_changes(signal, less)
             return by_stretch, by_bend, *by_sag
         x = self.load(signal)
@@ -139,31 +144,32 @@ class Stiffening(WallFibres, Memoryless):
     def quantities(self) -> list[Quantity]:
         """Shares of push lost at full load, the steepness and the fibres' mixture."""
         rubber = "wide: a rest of the push is left"
+        wall = "a wall that stiffens takes push and leaves some"
+        steepness = Quantity(
+            "steepness", value_of(self.log_steepness.exp()), "", 0.005, 12.0, rubber
+        )
+        if self.others is None:  # each share is that of a strain of its own
+            shares = [
+                Quantity("stretch_share", value_of(self.own), "", -0.1, 0.9, wall),
+                Quantity("bend_share", value_of(self.bend), "", -0.1, 0.9, wall),
+            ]
+            return [*shares, steepness, *self.sag_quantity()]
         total = float((self.own + self.bend).detach())
-        own = "own_share" if self.others is not None else "stretch_share"
-        less = -0.5 if self.body is None else -0.1
-        quantities = [
-            Quantity(own, value_of(self.own), "", less, 0.9, rubber),
-            Quantity("bend_share", value_of(self.bend), "", less, 0.9, rubber),
-            Quantity(
-                "total_share",
-                total,
-                "",
-                0.0,
-                0.9,
-                "a wall that stiffens takes push and leaves some",
-            ),
-            Quantity("steepness", value_of(self.log_steepness.exp()), "", 0.005, 12.0, rubber),
+        return [
+            Quantity("own_share", value_of(self.own), "", -0.5, 0.9, rubber),
+            Quantity("bend_share", value_of(self.bend), "", -0.5, 0.9, rubber),
+            Quantity("total_share", total, "", 0.0, 0.9, wall),
+            steepness,
+            *self.mixture(),
         ]
-        return [*quantities, *self.sag_quantity(), *self.mixture()]
 
     def readings(self, seconds: float | None = None) -> list[Reading]:
         """Push that is lost at full load, of one chamber alone and of all chambers at once, %; of
         the body what it bends and stretches less, %, and sags less, mm."""
         if self.body is not None:
             bend, own = (100 * float(each.detach()) for each in (self.bend, self.own))
-            angle = math.sqrt(self.full)
-            most = f"{math.degrees(angle):.0f} degrees", f"{100 * angle / SLENDERNESS:.2g} %"
+            angle, length = map(math.sqrt, self.full)
+            most = f"{math.degrees(angle):.0f} degrees", f"{100 * length / SLENDERNESS:.2g} %"
             readings = [
                 Reading(
                     f"bent by {most[0]} from base to tip, the body bends {{}} less", bend, "%", bend
@@ -204,7 +210,7 @@ def _of_body(facts: ArmFacts, points: Tensor) -> list[Effect]:
     """Stiffening by the strains of the body; none of a body at rest."""
     return [
         Stiffening(facts, steepness, body=body, full=full, weight=weight)
-        for body, full in most_strained(facts.rest_mm, points)
+        for body, full in hardest_strained(facts.rest_mm, points)
         for steepness in BODY_GRID
         for weight in ((False, True) if facts.gravity is not None else (False,))
     ]

@@ -68,6 +68,11 @@ class Twist(Effect):
         """Twist of the tip against the base at full load, rad."""
         return {"linear": self.linear, "quadratic": self.quadratic}
 
+    @property
+    def follows(self) -> bool:
+        """True: a wall that is loaded where the arm is held."""
+        return True
+
     def rest(self, signal: Tensor) -> Tensor:
         """(B, 1) mean load of the chambers of an arm at rest: zero."""
         return signal.new_zeros(len(signal), 1)

@@ -113,6 +113,25 @@ def test_more_of_an_effect_is_its_own_share(problem):
     assert np.sqrt(np.square(off).mean()) < 0.05 * np.sqrt(np.square(change / 0.1).mean())
 
 
+def test_more_of_a_wall_of_the_body_is_what_it_changes(problem):
+    """A tenth more of a creep of the body moves the key points by a tenth of the column."""
+    creep = make_effect("creep", problem.model.facts, body=True)
+    with torch.no_grad():
+        for amplitude in creep.amplitudes().values():
+            amplitude.fill_(0.2)
+    arm = with_effect(problem.model, "creep", creep.requires_grad_(False))
+    (candidate,) = [each for each in candidates(problem.with_model(arm), ["creep"]) if each.more]
+    with torch.no_grad():
+        same = problem.rows(arm.predict(problem.history)).numpy()
+        for amplitude in creep.amplitudes().values():
+            amplitude.mul_(1.1)
+        more = problem.rows(arm.predict(problem.history)).numpy()
+    change = more - same
+    off = change / 0.1 - candidate.sensitivities[..., 0]
+    assert np.sqrt(np.square(change).mean()) > 0.005
+    assert np.sqrt(np.square(off).mean()) < 0.05 * np.sqrt(np.square(change / 0.1).mean())
+
+
 def test_beside_more_of_an_effect_there_are_loops_of_other_widths(problem):
     """Loops add up, so a model with hysteresis may lack a narrow one; of creep there is no more."""
     made = candidates(problem, ["hysteresis"])

@@ -619,6 +619,17 @@ def test_the_confidence_is_the_probability_of_what_is_said(missing, known, two, 
             assert found.confidence in (p.network, p.nothing + p.network)
 
 
+def test_a_paired_difference_that_nothing_can_be_stated_of_is_not_told():
+    """No effect can be tested, too large for "nothing", too probably nothing for "unknown"."""
+    nothing = replace(
+        GOOD, effects=(), proposals=(), paired=True, error_over_validated=1.55, size=0.1
+    )
+    model = given_odds(missing=-3.0, known=0.0)
+    found = decide(nothing, model)
+    assert (found.kind, found.effects, found.statements) == ("cannot_tell", (), ())
+    assert found.confidence == pytest.approx(probabilities(nothing, model).nothing)
+
+
 def test_a_result_without_worth_is_not_told():
     """Missing for sure, and in the list or not by the toss of a coin: any name may harm."""
     found = decide(GOOD, given_odds(missing=0.0, known=0.0, first=CLEAR))

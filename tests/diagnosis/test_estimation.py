@@ -46,7 +46,7 @@ from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.recordings import Recording
 from surgisoft.report import Text
 from surgisoft.surrogate.checkpoint import default_arm
-from surgisoft.surrogate.effects import make_effect
+from surgisoft.surrogate.effects import Memoryless, make_effect
 from surgisoft.surrogate.effects.hysteresis import FEW_RADII
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import RecurrentArm
@@ -266,6 +266,60 @@ def test_a_slope_is_by_the_step_that_a_parameter_in_single_precision_takes():
     assert predict.steps.item() == pytest.approx(1e-6)
     assert slopes.item() == pytest.approx(2e4, rel=1e-6)
     assert parameter.item() == 1.0
+
+
+def test_a_slope_is_found_again_after_a_prediction_that_was_not_finite():
+    """Steps of a hundredth from 1 lead beyond 1.005, where nothing finite is predicted."""
+    parameter = torch.ones(1)
+
+    def forward():
+        value = parameter.double().view(1, 1, 1)
+        return torch.where(value > 1.005, torch.nan, value)
+
+    predict = Prediction(forward, {"x": parameter})
+    predict.steps[:] = 0.01
+    for start in (1.0, 0.5):
+        values = np.array([start])
+        slopes = predict.sensitivities(values, predict(values))
+        assert slopes.item() == pytest.approx(1.0, rel=1e-3)
+        assert np.isfinite(predict.steps).all()
+
+
+def test_many_amplitudes_of_an_effect_of_the_body_without_memory_are_fitted(monkeypatch):
+    """Thirty shifts of the key points along x, half of them of the upper and half of the lower
+    ones, whose sums are 0.6 and -0.3 mm."""
+
+    class Shifts(Memoryless):
+        stage = "body"
+
+        def __init__(self, facts):
+            super().__init__(facts)
+            self.size = torch.nn.Parameter(torch.zeros(30))
+
+        def amplitudes(self):
+            return {"size": self.size}
+
+        def apply(self, signal, memory):
+            upper = torch.arange(signal.shape[-2]) > 1
+            moved = torch.where(upper, self.size[:15].sum(), self.size[15:].sum())
+            return signal + moved[:, None] * signal.new_tensor([1.0, 0.0, 0.0])
+
+        def config(self):
+            return {}
+
+        def quantities(self):
+            return []
+
+    arm = bare_arm()
+    truth = with_effect(arm, "shifts", Shifts(arm.facts))
+    with torch.no_grad():
+        truth.effects["shifts"].size[:15] = 0.04
+        truth.effects["shifts"].size[15:] = -0.02
+    problem = problem_of(arm, [measured_on(truth, rows=80)], part="all")
+    model = with_effect(arm, "shifts", Shifts(arm.facts))
+    fit_amplitudes(model, problem, "shifts")
+    found = model.effects["shifts"].size.detach()
+    assert float(found[:15].sum() - found[15:].sum()) == pytest.approx(0.9, abs=0.15)
 
 
 def test_the_likelihood_of_a_fit_by_hand():

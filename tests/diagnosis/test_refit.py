@@ -24,6 +24,7 @@ from surgisoft.diagnosis.diagnose import (
     second_too,
     with_refit,
 )
+from surgisoft.diagnosis.estimation.effects import starts
 from surgisoft.diagnosis.estimation.intervals import Parameter
 from surgisoft.diagnosis.inputs import identification_problem
 from surgisoft.diagnosis.refit import (
@@ -40,6 +41,7 @@ from surgisoft.diagnosis.refit import (
     reason_to_refit,
     refit,
     run_job,
+    starting_model,
 )
 from surgisoft.diagnosis.residuals import TOGETHER
 from surgisoft.errors import InputError
@@ -792,6 +794,21 @@ def test_a_bad_mode_is_one_line_and_code_2(name, tmp_path, capsys):
     assert run([name, *given, *more, "--refit", "sometimes"]) == 2
     assert "sometimes" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
+
+
+def test_what_is_trained_with_a_network_begins_in_front_of_it(problem):
+    """Of a creep of the body its form of the body explains most, and only that of loads is trained:
+    the other one changes what the network predicts."""
+    creep = make_effect("creep", problem.model.facts, body=True)
+    with torch.no_grad():
+        for amplitude, size in zip(creep.amplitudes().values(), (0.4, 0.2), strict=True):
+            amplitude.fill_(size)
+    truth = with_effect(problem.model, "creep", creep.requires_grad_(False))
+    with torch.no_grad():
+        crept = problem.rows(truth.predict(problem.history)).double().numpy()
+    posed = replace(problem, measured=crept)
+    assert starts(posed, "creep", 1)[0].effects["creep"].stage == "body"
+    assert starting_model(posed, ["creep"]).effects["creep"].stage == "material"
 
 
 def test_what_cannot_be_fitted_together_is_refused(problem, tmp_path, capsys):

@@ -7,7 +7,13 @@ import torch
 
 from surgisoft.surrogate import chain
 from surgisoft.surrogate.chain import Holding, RepeatedScan, Signal, context_of, memory_at
-from surgisoft.surrogate.effects import STAGES, effect_class, hypothesis_of, make_effect
+from surgisoft.surrogate.effects import (
+    STAGES,
+    Memoryless,
+    effect_class,
+    hypothesis_of,
+    make_effect,
+)
 from surgisoft.surrogate.effects.drift import Drift
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import ConstantCurvature
@@ -364,3 +370,71 @@ def test_one_long_run_beside_short_ones_is_followed_as_each_alone(names, away, m
 def _tensors(seen) -> dict:
     """The fields of a history that hold tensors."""
     return {k: v for k, v in vars(seen).items() if isinstance(v, torch.Tensor)}
+
+
+def forms(name: str, arm: ArmModel, seen) -> list:
+    """One effect of each stage at which identification tries an effect, at amplitudes of 0.1."""
+    tried = hypothesis_of(effect_class(name)).candidates(arm.facts, seen.rows(arm.predict(seen)))
+    answer = list({effect.stage: effect for effect in tried}.values())
+    for effect in answer:
+        for parameter in effect.amplitudes().values():
+            parameter.data.fill_(0.1)
+        effect.requires_grad_(False)
+    return answer
+
+
+@EACH
+def test_a_repeated_scan_follows_again_what_its_memory_depends_on(name, away, monkeypatch):
+    """Not what a changed amplitude leaves as it was; the prediction is that of a fresh scan."""
+    for effect in forms(name, model(()), away):
+        effects = {**model(["hysteresis"]).effects, "own": effect}
+        arm = model(()).replace(effects=effects)
+        first = arm.first_pressure(away)
+        followed = []
+        plain = type(effect).scan
+
+        def scan(self, *given, plain=plain, own=effect, followed=followed):
+            followed.extend([1] * (self is own))
+            return plain(self, *given)
+
+        monkeypatch.setattr(type(effect), "scan", scan)
+        repeated = RepeatedScan(arm.chain, away, first, {"own"}, away.rows)
+        with torch.no_grad():
+            repeated()
+            once = len(followed)
+            for parameter in effect.amplitudes().values():
+                parameter.mul_(1.5)
+            now = repeated()
+            assert len(followed) == once or isinstance(effect, Memoryless)
+            assert torch.equal(now, RepeatedScan(arm.chain, away, first, {"own"}, away.rows)())
+            for parameter in effect.memory_parameters():
+                followed.clear()
+                parameter.add_(0.1)
+                now = repeated()
+                assert followed or once == 0
+                again = RepeatedScan(arm.chain, away, first, {"own"}, away.rows)()
+                assert torch.equal(now, again)
+        monkeypatch.undo()
+
+
+def test_gradients_reach_what_a_memory_depends_on_in_every_call(away):
+    """A memory that was kept without gradients does not stand in the way of them."""
+    arm = model(["line_lag"])
+    repeated = RepeatedScan(arm.chain, away, arm.first_pressure(away), {"line_lag"}, away.rows)
+    with torch.no_grad():
+        repeated()
+    lag = arm.effects["line_lag"].requires_grad_(True)
+    for _ in range(2):
+        lag.zero_grad()
+        repeated().square().sum().backward()
+        assert float(lag.log_up.grad.abs()) > 0.0
+
+
+def test_a_held_arm_is_twisted_by_the_load_that_it_is_held_at():
+    """Mean load of 30, 25 and 20 in a range whose larger end is 50: 0.5."""
+    arm = model(["twist"])
+    state, _ = arm.chain.standing(torch.tensor([[30.0, 25.0, 20.0]]))
+    reach = torch.maximum(arm.facts.high - arm.facts.rest, arm.facts.rest - arm.facts.low)
+    load = ((torch.tensor([30.0, 25.0, 20.0]) - arm.facts.rest) / reach).mean()
+    assert float(state.memory["twist"]) == pytest.approx(float(load), rel=1e-6)
+    assert float(load) > 0.3

@@ -11,7 +11,9 @@ from surgisoft.errors import InputError
 from surgisoft.surrogate.effects import make_effect
 from surgisoft.surrogate.effects.bent_body import (
     ENERGIES,
+    LEAST_ENERGY,
     SLENDERNESS,
+    hardest_strained,
     most_strained,
 )
 from tests.surrogate.effects.bodies import LENGTH, NODES, STRAIGHT, along, arc, body, facts
@@ -150,6 +152,45 @@ def test_energies_of_a_much_strained_body_are_those_of_its_hardest_postures():
     assert found == {each: pytest.approx(0.98**2 * mean, rel=0.01) for each in ENERGIES}
     assert most_strained(STRAIGHT.float(), STRAIGHT.float().expand(5, -1, -1)) == []
     assert most_strained(STRAIGHT.float(), shapes[:1].float()) == []
+
+
+def test_a_stiffening_body_is_scaled_by_the_node_that_each_strain_is_largest_at():
+    """Arcs bend every node but that at the clamp alike; a body that is stretched by a tenth, too,
+    has an energy of 1 rad^2 of it."""
+    angles = torch.linspace(0.0, 1.0, 101).tolist()
+    bent = torch.stack([arc(1e-3 + angle) for angle in angles]).float()
+    (_, (bend, stretch)), (_, whole) = hardest_strained(STRAIGHT.float(), bent)
+    assert bend == pytest.approx(0.98**2, rel=0.01)
+    assert stretch == pytest.approx(LEAST_ENERGY * bend, rel=0.05)
+    assert whole == pytest.approx((bend, bend), rel=1e-3)
+    longer = torch.stack([arc(1e-3 + a, 0.0, (1 + 0.1 * a) * LENGTH) for a in angles]).float()
+    (_, (_, stretch)), _ = hardest_strained(STRAIGHT.float(), longer)
+    assert stretch == pytest.approx((SLENDERNESS * 0.1 * 0.98) ** 2, rel=0.02)
+    assert hardest_strained(STRAIGHT.float(), bent[:1]) == []
+
+
+@pytest.mark.parametrize("steepness", [0.01, 3.0, 12.0])
+def test_beyond_the_range_a_body_stiffens_along_the_tangent(steepness):
+    """Four times the energy at which the share is lost: one and three slopes of the exponential at
+    that energy. Going on exponentially it would be exp(3 x 12) times as much."""
+    stiff = make_effect("stiffening", facts(), steepness=steepness, body="apart", full=0.25)
+    slope = steepness / -math.expm1(-steepness)
+    share = 1 + 3 * slope
+    stiff.bend.data.fill_(0.01 / share)
+    (points,) = along(stiff, arc(1.0))
+    expected = arc(0.99) - arc(1.0)
+    assert torch.allclose(points - arc(1.0), expected, atol=0.06 * 0.01 * LENGTH)
+    assert float((points - arc(1.0)).abs().max()) >= 0.9 * float(expected.abs().max())
+
+
+@pytest.mark.parametrize("name", ["stiffening", "softening"])
+def test_shares_of_two_strains_are_plausible_each_for_itself(name):
+    """Half of the bending and half of the stretch may be lost, half and half of one push not."""
+    for form, plausible in (({"section": True}, True), ({"body": "apart"}, True), ({}, False)):
+        effect = make_effect(name, facts(), **form)
+        for amplitude in effect.amplitudes().values():
+            amplitude.data.fill_(0.6)
+        assert effect.plausible() is plausible, form
 
 
 @pytest.mark.parametrize("name", ["stiffening", "softening"])

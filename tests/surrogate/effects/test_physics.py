@@ -328,6 +328,25 @@ def test_chambers_beside_each_other_are_neighbours_in_the_ring_of_a_segment():
     assert beside(2).tolist() == [[0, 1], [1, 0]]
 
 
+@pytest.mark.parametrize(
+    ("who", "lost"), [("next", [1, 2, 0, 4, 5, 3]), ("previous", [2, 0, 1, 5, 3, 4])]
+)
+def test_the_next_chamber_is_that_of_the_ring_of_its_segment(who, lost):
+    """Of six chambers in two segments each loses to one of its own segment alone."""
+    six = ArmFacts(torch.zeros(6), torch.full((6,), 50.0), torch.zeros(6), torch.zeros(5, 3))
+    coupled = with_strength(make_effect("coupling", six, who=who), product=0.2)
+    loads = torch.arange(1.0, 7.0)[None] / 10
+    assert torch.allclose(run(coupled, loads), loads - 0.2 * loads * loads[:, lost])
+
+
+def test_loops_of_one_chamber_have_no_mixture_to_fit():
+    """Its line is its own actuation; what is fitted are the weights of its play operators."""
+    play = make_effect("hysteresis", RANGE, radii=(0.1, 0.3), chamber=1)
+    assert play.nonlinear_parameters() == {}
+    assert {name: len(p) for name, p in play.amplitudes().items()} == {"own": 2}
+    assert torch.equal(play.linear[1], torch.tensor([0.0, 1.0, 0.0]))
+
+
 def test_damage_is_there_at_the_largest_load_too():
     """Half of the loss at an energy of three widths: 1 - (1 + 3)^(-1/2)."""
     soft = make_effect("softening", RANGE, width=1 / 3, damage=True)

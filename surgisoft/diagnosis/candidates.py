@@ -321,7 +321,7 @@ def _loads(problem: Problem, name: str, effect: Effect, body: np.ndarray) -> lis
     shape = (*history.valid.shape, *body.shape[1:])
     points = torch.zeros(shape, dtype=torch.float32)
     points[history.valid] = torch.from_numpy(body).float()
-    # Rows of padding repeat the last one.
+    # Rows of padding are zeros, and none of them is looked at.
     still = effect.sensitivities(points, points.new_zeros(*shape[:2], 0))
     answer = [Candidate(name, effect, _rows(problem, still), removable=True)]
     if facts.gravity is None or not problem.table.timed.any():

@@ -117,7 +117,8 @@ def _beyond_cubics(basis: np.ndarray, candidate: Candidate) -> bool:
 
 
 def cubics(pressure: np.ndarray) -> np.ndarray:
-    """(S, F) orthonormal basis of the cubics of the actuation (S, m), scaled to [-1, 1]."""
+    """(S, F) orthonormal basis of functions of the actuation (S, m), scaled to [-1, 1]: constant,
+    linear, products of two chambers and third powers of each."""
     pairs = (pressure[:, :, None] * pressure[:, None, :])[:, *np.triu_indices(pressure.shape[1])]
     ones = np.ones((len(pressure), 1))
     return np.linalg.qr(np.hstack([ones, pressure, pairs, pressure**3]))[0]

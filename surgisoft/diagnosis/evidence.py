@@ -28,10 +28,6 @@ of bending, and over the shortest correlation that the cross-validation tries (`
 rows) a block of about 17 rows has three."""
 COLLINEAR_RIDGE = 1e-6
 """Ridge, as a share of the mean power of the sensitivities, of the regression for collinearity."""
-CALM = 0.3
-"""Squared error that is added to each block before blocks are compared, over what the model's
-validated error and the noise announce in it: below that blocks differ by chance. The inner loss of
-the fits is flat about it (docs/results/decision.md) [-]."""
 TINY = 1e-9
 """Share of an effect's power in all motions that counts as none in one of them: its amplitude there
 is as good as unknown, and has next to no weight."""
@@ -78,10 +74,6 @@ class EffectEvidence:
     variation: float | None = None
     """Variance of its amplitude between motions, in units of its square, beyond what the error that
     it leaves makes of it (`variation`); None in stored evidence that does not have it."""
-    excess_log_gain: float | None = None
-    """As `log_gain`, each block weighted by the share of its squared error beyond what the model's
-    validated error and the noise announce: where there is nothing to explain an effect need not
-    explain anything. None in stored evidence that does not have it."""
 
     @property
     def size(self) -> int:
@@ -219,9 +211,6 @@ class Evidence:
     """End of it, s; 0 where a step explains as much."""
     slide_mm: float = 0.0
     """How far the key point is shifted at the end of it, mm."""
-    concentration: float = 0.0
-    """How concentrated in time the error is that nothing explains (`concentration_of`); 0 in stored
-    evidence that does not have it."""
 
     def to_json(self) -> dict:
         """Plain values; no frequency of a line, no moment of a jump and no slide where there is
@@ -267,10 +256,8 @@ def evidence_of(found: Findings) -> Evidence:
     beside = selection.explainable(null, [box.losses, *(s.losses for s in found.first)])
     beyond = beyond_history(problem, box.features)
     sudden, sudden_at_s = sudden_gain(found)
-    announced = announced_by_block(problem)
-    validated = float(announced.sum())
-    tried = [free, *(s.losses for s in found.first)]
-    tried += [selection.losses(each.chosen) for each in found.proposals]
+    stated = problem.discrepancy_mm**2 + problem.noise_mm**2
+    validated = float((seen.sum(0) * stated).sum())
     return Evidence(
         error_over_floor=math.sqrt(raw.sum() / floor),
         error_over_validated=math.sqrt(raw.sum() / validated),
@@ -295,37 +282,8 @@ def evidence_of(found: Findings) -> Evidence:
         sudden_log_gain=float(sudden.mean()),
         sudden_margin=_margin(found, sudden),
         sudden_at_s=sudden_at_s,
-        concentration=concentration_of(min(tried, key=np.sum), announced),
         **abrupt_changes(problem),
     )
-
-
-def announced_by_block(problem: Problem) -> np.ndarray:
-    """(B,) squared error that the validated error of the model and the noise announce, mm^2."""
-    seen = np.isfinite(problem.residual).all(2)
-    square = problem.discrepancy_mm**2 + problem.noise_mm**2
-    return block_sums((seen * square).sum(1), problem.block)
-
-
-def concentration_of(left: np.ndarray, announced: np.ndarray) -> float:
-    """How unequally an error is distributed over blocks: 0 where it is as large everywhere.
-
-    The mean logarithmic deviation (Theil 1967, "Economics and Information Theory", ch. 4), log of
-    the arithmetic over the geometric mean, of the squared error (B,) that is left over what is
-    announced (B,), CALM added. An effect that is always there leaves its error in all motions. A
-    valve that sticks now and then or a knock leaves it where it happens.
-    """
-    level = left / np.maximum(announced, 1e-30) + CALM
-    return float(np.log(level.mean()) - np.log(level).mean())
-
-
-def excess_log_gain(selection: ModelSelection, losses: np.ndarray) -> float:
-    """`EffectEvidence.excess_log_gain` of an effect that leaves losses (B,), mm^2."""
-    before = selection.losses()
-    announced = announced_by_block(selection.problem)
-    excess = np.maximum(1.0 - announced / np.maximum(before, 1e-30), 0.0)
-    gains = selection.log_ratio(before, losses)
-    return float(excess @ gains / excess.sum()) if excess.any() else float(gains.mean())
 
 
 def abrupt_changes(problem: Problem) -> dict[str, Any]:
@@ -430,7 +388,6 @@ def _effect(found: Findings, best: Score, score: Score) -> EffectEvidence:
         form_log_gain=None if form is None else form.log_gain,
         form_z=None if form is None else normal_quantile(form.p_value),
         variation=variation(found, [score])[0],
-        excess_log_gain=excess_log_gain(selection, score.losses),
     )
 
 

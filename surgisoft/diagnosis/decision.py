@@ -64,7 +64,7 @@ what is missing; how well recordings of an unchanged arm agree is not known well
 too few motions; the schedule does not tell effects apart; the model does not describe the
 recordings from before a change; even with the most probable effect it leaves most of the motion."""
 
-SCHEMA = 9
+SCHEMA = 8
 """Version of the asset's format and of the features: weights belong to the features that they were
 fitted with, so an asset of another version is fitted again."""
 ASSET = Path(__file__).parents[1] / "assets" / "decision" / "decision.json"
@@ -202,17 +202,6 @@ def _distinct(evidence: Evidence) -> float:
     An effect that is missing stands out, with a relative of it perhaps. Of noise all explain alike.
     """
     return _between(evidence.effects[2].left, -0.5, 1.0) if len(evidence.effects) > 2 else 0.0
-
-
-def _left_over_floor(evidence: Evidence) -> float:
-    """Log of the error over the noise floor that neither a black box nor a proposal explains.
-
-    The error of a model that is off is a function of the actuation and its past, which a black box
-    learns; so is a known effect. What neither of them explains is none of both.
-    """
-    share = max(evidence.free_box, _explained(evidence))
-    above = max(evidence.error_over_floor**2 - 1.0, 0.0)
-    return _log(math.sqrt(1.0 + above * max(1.0 - share, 0.0)), 0.0, 2.5)
 
 
 def _uneven(evidence: Evidence) -> float:
@@ -374,10 +363,10 @@ SHIFT_MEANS = "root of the share of the error that one shifted key point makes, 
 """Meanings of two features that three models have."""
 MISSING = (
     Feature(
-        "left_over_floor",
+        "above_floor",
         +1,
-        _left_over_floor,
-        "log of the error over the noise floor that neither a black box nor a proposal explains",
+        lambda e: _log(e.error_over_floor, 0.0, 2.0),
+        "log of the error over the noise floor",
     ),
     Feature(
         "beside_discrepancy",

@@ -395,16 +395,6 @@ def test_an_effect_that_helps_in_few_blocks_only_is_uneven():
     assert chances[1] < chances[0] == chances[2]
 
 
-def test_what_a_black_box_or_an_effect_explains_does_not_say_that_something_is_missing():
-    """An error of five times the floor, 24 of its square above: all of it is left, or a tenth."""
-    place = [feature.name for feature in FEATURES["missing"]].index("left_over_floor")
-    for box, gain, left in ((0.0, 0.0, 24.0), (0.9, 0.0, 2.4), (0.0, 0.9, 2.4), (1.0, 0.5, 0.0)):
-        proposals = (replace(ALONE, gain=gain),) if gain else ()
-        evidence = replace(GOOD, free_box=box, proposals=proposals)
-        found = features_of("missing", evidence)[place]
-        assert found == pytest.approx(0.5 * math.log(1.0 + left))
-
-
 @pytest.mark.parametrize(("third", "distinct"), [(0.4, 0.4), (3.0, 1.0), (None, 0.0)])
 def test_an_effect_is_distinct_as_far_as_the_third_one_leaves_more(third, distinct):
     """The second one may be a relative of it that does the same."""
@@ -548,10 +538,10 @@ def test_features_are_finite_of_order_one():
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (lambda v: v["models"]["missing"]["weights"].update(left_over_floor=99.0), "hash"),
+        (lambda v: v["models"]["missing"]["weights"].update(above_floor=99.0), "hash"),
         (lambda v: v.update(schema=99), "schema 99"),
         (lambda v: v.update(schema=SCHEMA - 1), f"expected {SCHEMA}; fit it again"),
-        (lambda v: v["models"]["missing"]["weights"].pop("left_over_floor"), "hash"),
+        (lambda v: v["models"]["missing"]["weights"].pop("above_floor"), "hash"),
     ],
 )
 def test_a_damaged_asset_is_refused_in_one_line(tmp_path, change, told):
@@ -593,7 +583,7 @@ def test_an_asset_of_other_features_is_refused(tmp_path):
     values["sha256"] = content_hash(values)
     bad = tmp_path / "decision.json"
     bad.write_text(json.dumps(values))
-    with pytest.raises(InputError, match="expected left_over_floor"):
+    with pytest.raises(InputError, match="expected above_floor"):
         load_decision(bad)
     bad.write_text("no json")
     with pytest.raises(InputError, match="no fitted decision"):

@@ -779,8 +779,8 @@ def test_an_amendment_of_few_pairs_is_checked_where_they_are_asked_for(model):
     asked = amend(model, turned, "misalignment", paired="always", **settings)
     assert asked.model_error is not None
     assert asked.claimed
-    (note,) = asked.notes
-    assert note.startswith("67 % of the rows have no partner in earlier, and what changed there is")
+    note = "67 % of the rows have no partner in earlier, and what changed there is"
+    assert sum(each.startswith(note) for each in asked.notes) == 1
     plain = amend(model, turned, "misalignment", **settings)
     assert plain.model_error is None
 

@@ -62,9 +62,13 @@ class Safety:
     """Highest actuation that is sent, beside the rig's own limit [unit]."""
     rate: Annotated[float, "fastest change [unit/s]; 0: the rig's range in a second"] = 0.0
     """Fastest change of a set point [unit/s]; 0: the whole range of the rig in a second."""
-    hold_ms: Annotated[float, "no key point, pressure or valid command so long: hold [ms]"] = 500.0
+    hold_ms: Annotated[float, "hold after so long without key point, pressure or command [ms]"] = (
+        500.0
+    )
     """Time without key points, pressures or valid commands after which pressures are held [ms]."""
-    vent_ms: Annotated[float, "no key point, pressure or valid command so long: vent [ms]"] = 2000.0
+    vent_ms: Annotated[float, "vent after so long without key point, pressure or command [ms]"] = (
+        2000.0
+    )
     """Time after which the arm is vented and the run stops [ms]."""
 
     def __post_init__(self):

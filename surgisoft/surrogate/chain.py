@@ -652,10 +652,10 @@ class Chain:
 class RepeatedScan:
     """Prediction (S, n, 3) in mm, by calling, while parameters of some effects change.
 
-    Links in front of the first one that may change are computed once, and so is its memory as long
-    as the parameters stay equal that this depends on. Memories follow every row; the network, and
-    effects behind it unless one of them has memory, compute the requested rows alone. Autograd runs
-    through parameters that require it.
+    Links in front of the first one that may change are computed once. So is the memory of that
+    link, as long as the parameters that it depends on stay equal. Memories follow every row; the
+    network, and effects behind it unless one of them has memory, compute the requested rows alone.
+    Autograd runs through parameters that require it.
     """
 
     def __init__(
@@ -705,13 +705,13 @@ class RepeatedScan:
     def _mode(self) -> Scanning:
         """A scan from the memories before the first row, for the present parameters."""
         rows, followed = self.rows if self.thin else None, self._still_followed()
-        if followed is not None and self._nothing_follows_behind():
-            start, known = followed.start, {self.links[0].name: followed.memory}
-            return Scanning(start, self.context, rows, history=self.history, known=known)
-        runs = self.history.runs
-        start = self.chain.standing(self.first, signals=False)[0].memory
-        start = {name: memory.expand(runs, *memory.shape[1:]) for name, memory in start.items()}
         known = {} if followed is None else {self.links[0].name: followed.memory}
+        if followed is not None and self._nothing_follows_behind():
+            start = followed.start
+        else:
+            runs = self.history.runs
+            start = self.chain.standing(self.first, signals=False)[0].memory
+            start = {name: memory.expand(runs, *memory.shape[1:]) for name, memory in start.items()}
         return Scanning(start, self.context, rows, history=self.history, known=known)
 
     def _walked(self, links: tuple[Link, ...] | None = None) -> tuple[Scanning, Signal]:
@@ -740,8 +740,8 @@ class RepeatedScan:
         """The memory of the first link that was kept, if its parameters are still the same."""
         if self.followed is None:
             return None
-        on, pairs = self._on(), self.followed.on
-        if on is None or not all(map(torch.equal, on, pairs)):
+        on = self._on()
+        if on is None or not all(map(torch.equal, on, self.followed.on)):
             return None
         return self.followed
 

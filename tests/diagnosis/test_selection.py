@@ -273,6 +273,14 @@ def test_what_is_reached_can_be_explained():
     assert ModelSelection.explainable(known, before, []) == pytest.approx(4.0)
 
 
+def test_more_amplitudes_never_rank_higher():
+    """Also of log gains below zero, where an effect makes the error larger."""
+    for gain in (-1.0, -0.01, 0.0, 0.5):
+        prices = [SEARCH.priced(gain, count) for count in (1, 4, 12, 40)]
+        assert prices == sorted(prices, reverse=True)
+    assert SEARCH.priced(-1.0, 12) == pytest.approx(-1.036)
+
+
 def test_each_of_the_first_twelve_amplitudes_costs_three_thousandths():
     assert SEARCH.priced(2.0, 0) == 2.0
     assert SEARCH.priced(2.0, 4) == pytest.approx(2.0 * (1.0 - 0.012))

@@ -320,8 +320,8 @@ def starts(
     tried = [each for each in every if each.effect.stage in stages]
     if every and not tried:
         raise InputError(
-            f"only forms of '{name}' that act behind the network change anything on these "
-            "recordings, and none of them is fitted together with it; pass --refit never"
+            f"on these recordings '{name}' changes something only in forms that act behind the "
+            "network, and these are not trained together with it; pass --refit never"
         )
     if not tried:
         raise InputError(

@@ -19,8 +19,8 @@ ENERGIES = ("apart", "whole")
 HARD = 0.98
 """Quantile over recordings of the mean energy of the nodes at which a body is much strained."""
 LEAST_ENERGY = 1e-3
-"""Share of one energy, of bending or of stretch, that the other one is at least taken to be where
-it scales a law: a fiftieth of the strain or less is none that a wall stiffens by [-]."""
+"""Least ratio of the smaller to the larger of two energies, of bending and of stretch, where they
+scale a law: a wall does not stiffen by a strain below a thirtieth of the other one [-]."""
 STILL_MM = 1e-3
 """Range of the key points below which a body is at rest, far below the noise of cameras, mm."""
 TINY = 1e-6

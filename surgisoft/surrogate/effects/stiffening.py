@@ -27,10 +27,9 @@ where gravity is known,
     b_k -> b_k (1 - bend h(W / full)),    e_k -> e_k (1 - own h(W / full)),
     q = p - sag mean_k h(W / full) u(p).
 
-`full` is the energy of the most strained node where the arm is much strained, that of bending and
-that of stretch each for itself, so that amplitudes are losses there. Beyond it, and beyond the
-energy at full load, h goes on along its tangent: a recording beyond the range of the fit must not
-blow up.
+`full` is the energy of the most strained node where the arm is much strained, one for bending and
+one for stretch, so that amplitudes are losses there. Beyond it, and beyond the energy at full load,
+h continues along its tangent: predictions beyond the range of the fit must not blow up.
 """
 
 import math

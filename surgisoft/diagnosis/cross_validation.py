@@ -361,6 +361,35 @@ class CrossValidation:
             self.best[key] = losses[0, 0]
         return self.best[key]
 
+    def losses_of(
+        self, sets: Sequence[Sequence[int]], common: Sequence[Sequence[int]] | None = None
+    ) -> np.ndarray:
+        """(N, B) `losses` of each of N sets of sensitivities.
+
+        common: for each set those of it that other sets have, too; None: none. Sets of few
+        sensitivities take less time to solve than a call from Python, so those that were not tried
+        yet are solved in one call.
+        """
+        found = [_rising(each) for each in sets]
+        shared = [()] * len(sets) if common is None else common
+        new = {
+            key: each
+            for each, known in zip(found, shared, strict=True)
+            if (key := each.tobytes()) not in self.best
+            and key not in self.solved
+            and len(known) < LARGE
+        }
+        if new:
+            rows = np.concatenate([np.append(0, each + 1) for each in new.values()])
+            ends = np.cumsum([1 + len(each) for each in new.values()])
+            losses = np.empty((len(new), len(self.split.fold)))
+            held_out, by_fold, fold = self.held_out, self.by_fold, self.split.fold
+            products = (held_out.first, held_out.further, by_fold.first, by_fold.further)
+            _losses_of(self.grams, *products, rows, ends, np.array(RIDGES), fold, losses)
+            self.best.update(zip(new, losses, strict=True))
+        answer = [self.losses(each, known) for each, known in zip(found, shared, strict=True)]
+        return np.array(answer).reshape(len(sets), len(self.split.fold))
+
     def losses_without_each(self, groups: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
         """(B,) `losses` with the sensitivities of all groups but one, for each group in turn.
 
@@ -816,6 +845,48 @@ def _solve(grams, rows, ridges, known, kept, amplitudes):
                         else:
                             found[j] -= lower[i, j] * found[i]
                     amplitudes[level, ridge, number, i] = found[i] / size[i]
+
+
+@compiled
+def _losses_of(grams, first, further, fold_first, fold_further, rows, ends, ridges, fold, losses):
+    """Write held-out sums of squares of sets of sensitivities into losses (N, B), mm^2.
+
+    grams: as in CrossValidation; first and further: products on each block, fold_first and
+    fold_further on each fold, as in HeldOut; rows: those of each set, 0 first, one set after
+    another; ends (N,): where each ends; fold (B,) of each block. The level and the ridge of a set
+    are those that leave least in all; a single sensitivity has the least ridge.
+    """
+    levels, folds = grams.shape[:2]
+    known = np.empty((levels, folds, len(ridges), 0, 1))
+    kept = np.empty((levels, folds, len(ridges), 0, 0))
+    each, begin = np.arange(levels * folds), 0
+    for number in range(len(ends)):
+        own = rows[begin : ends[number]]
+        begin = ends[number]
+        count = len(own) - 1
+        amplitudes = np.empty((levels, len(ridges), folds, count))
+        _solve(grams, own, ridges, known, kept, amplitudes)
+        together = np.empty((1, len(ridges), levels * folds, count))
+        for level in range(levels):
+            for ridge in range(len(ridges)):
+                for one in range(folds):
+                    for i in range(count):
+                        value = amplitudes[level, ridge, one, i]
+                        together[0, ridge, level * folds + one, i] = value
+        sums = np.empty((1, len(ridges), levels * folds))
+        _sum_squares(fold_first, fold_further, own, together, each, sums)
+        least, best_level, best_ridge = np.inf, 0, 0
+        for level in range(levels):
+            for ridge in range(len(ridges) if count > 1 else 1):
+                total = 0.0
+                for one in range(folds):
+                    total += sums[0, ridge, level * folds + one]
+                if total < least:
+                    least, best_level, best_ridge = total, level, ridge
+        some = amplitudes[best_level : best_level + 1, best_ridge : best_ridge + 1]
+        place = losses[number : number + 1].reshape(1, 1, losses.shape[1])
+        level = best_level
+        _sum_squares(first[level : level + 1], further[level : level + 1], own, some, fold, place)
 
 
 def split_of(problem: Problem) -> Split:

@@ -262,9 +262,10 @@ class ModelSelection:
         """Every form of every effect on top of a base, plausible or not, in no order."""
         before = self.losses(base)
         choices = [w for name, some in self.options.items() if name not in without for w in some]
-        after = [self.losses(base + option.chosen, base) for option in choices]
         if not choices:
             return []
+        sets = [base + option.chosen for option in choices]
+        after = list(self.validation.losses_of(sets, [base] * len(sets)))
         gains = np.array([self.log_ratio(before, losses) for losses in after])
         chances = sign_flip_p_values(
             self.problem.by_motion(gains), [option.effect for option in choices]
@@ -570,27 +571,26 @@ def best_pair(selection: ModelSelection, effects: Sequence[str]) -> tuple[Score,
     null = selection.losses()
     tried: dict[tuple[Option, Option], float] = {}
 
-    def worth(a: Option, b: Option) -> float:
-        if (a, b) not in tried:
-            common = max(a.chosen, b.chosen, key=len)
-            tried[a, b] = _together(selection, null, a.chosen + b.chosen, common)
-        return tried[a, b]
+    def worths(pairs: list[tuple[Option, Option]]) -> list[float]:
+        new = [pair for pair in pairs if pair not in tried]
+        sets = [a.chosen + b.chosen for a, b in new]
+        common = [max(a.chosen, b.chosen, key=len) for a, b in new]
+        tried.update(zip(new, _together(selection, null, sets, common), strict=True))
+        return [tried[pair] for pair in pairs]
 
     def improved(a: Option, b: Option) -> tuple[Option, Option]:
         """The better of exchanging one form beside the other one."""
-        one = max(selection.options[a.effect], key=lambda form: worth(form, b))
-        two = max(selection.options[b.effect], key=lambda form: worth(a, form))
-        return max(((one, b), (a, two)), key=lambda pair: worth(*pair))
+        pairs = [(form, b) for form in selection.options[a.effect]]
+        pairs += [(a, form) for form in selection.options[b.effect]]
+        return pairs[int(np.argmax(worths(pairs)))]
 
-    best = [
-        max(
-            selection.options[effect],
-            key=lambda form: _together(selection, null, form.chosen),
-        )
-        for effect in effects
-    ]
+    best = []
+    for effect in effects:
+        forms = selection.options[effect]
+        alone = _together(selection, null, [form.chosen for form in forms])
+        best.append(forms[int(np.argmax(alone))])
     found = [improved(a, b) for a, b in combinations(best, 2)]
-    for pair in sorted(found, key=lambda pair: -worth(*pair))[: SEARCH.pairs]:
+    for pair in sorted(found, key=lambda pair: -tried[pair])[: SEARCH.pairs]:
         while (better := improved(*pair)) != pair:
             pair = better
     for a, b in sorted(tried, key=lambda pair: -tried[pair]):
@@ -602,17 +602,19 @@ def best_pair(selection: ModelSelection, effects: Sequence[str]) -> tuple[Score,
 def _together(
     selection: ModelSelection,
     null: np.ndarray,
-    chosen: tuple[int, ...],
-    common: tuple[int, ...] = (),
-) -> float:
-    """How well sensitivities explain: mean log gain of the blocks plus log gain of the whole error.
+    sets: Sequence[tuple[int, ...]],
+    common: Sequence[tuple[int, ...]] | None = None,
+) -> list[float]:
+    """How well sets of sensitivities explain: mean log gain of the blocks plus log gain of the
+    whole error.
 
     Few blocks that fall by much and many that fall by little both count. The noise is added to
-    both, and amplitudes have their price.
+    both, and amplitudes have their price. common: as of `CrossValidation.losses_of`.
     """
-    losses, floor = selection.losses(chosen, common), selection.floor.sum()
-    whole = float(np.log((null.sum() + floor) / (losses.sum() + floor)))
-    return SEARCH.priced(selection.log_ratio(null, losses).mean() + whole, len(chosen))
+    losses, floor = selection.validation.losses_of(sets, common), selection.floor.sum()
+    whole = np.log((null.sum() + floor) / (losses.sum(axis=1) + floor))
+    gains = selection.log_ratio(null, losses).mean(axis=1) + whole
+    return [SEARCH.priced(float(gain), len(each)) for gain, each in zip(gains, sets, strict=True)]
 
 
 def _in_order(selection: ModelSelection, *some: Option) -> tuple[Score, ...]:

@@ -102,6 +102,29 @@ def test_what_sets_have_in_common_is_factorised_once(monkeypatch, data, common):
     assert found.amplitudes([2, 0, 1]) == pytest.approx(plain, rel=1e-9)
 
 
+@pytest.mark.parametrize("common", [None, [(), (1,), (0, 2), (0, 2), ()]])
+@pytest.mark.parametrize("seed", range(3))
+def test_losses_of_many_sets_are_those_of_each(monkeypatch, data, seed, common):
+    """Sets of other sizes, one of them twice; the last of three columns was added later."""
+    if common:
+        monkeypatch.setattr(cross_validation, "LARGE", 2)
+    features, _, columns, *rest = data
+    rng = np.random.default_rng(seed)
+    residual = rng.normal(size=columns.shape[:3]) + 0.3 * columns @ rng.normal(size=COLUMNS)
+    sets = [(), (1,), (2, 0), (0, 1, 2), (1,)]
+    limits = np.array([0.3, 0.5]), np.array([0.1, 0.1])
+    given = features, residual, columns[..., :2], *rest
+    one, many = (
+        cross_validated(*given, *limits).extended(columns[..., 2:].astype(np.float32))
+        for _ in range(2)
+    )
+    found = many.losses_of(sets, common)
+    for each, losses in zip(sets, found, strict=True):
+        np.testing.assert_allclose(losses, one.losses(each), rtol=1e-12)
+    np.testing.assert_array_equal(many.losses_of(sets), found)
+    assert many.losses_of([]).shape == (0, BLOCKS)
+
+
 @pytest.mark.parametrize("faint", [False, True])
 def test_losses_without_each_group_are_those_of_joint_fits(data, faint):
     """Each of two groups left out; with a column next to nothing, too, which no ridge scales."""

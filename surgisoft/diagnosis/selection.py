@@ -211,6 +211,14 @@ class ModelSelection:
         """
         return self.validation.losses(chosen, common)
 
+    def losses_of(
+        self,
+        sets: Sequence[tuple[int, ...]],
+        common: Sequence[tuple[int, ...]] | None = None,
+    ) -> np.ndarray:
+        """(N, B) `losses` of N sets of sensitivities (`CrossValidation.losses_of`)."""
+        return self.validation.losses_of(sets, common)
+
     def rmse_mm(self, losses: np.ndarray) -> float:
         """RMS distance of a key point, mm."""
         return float(np.sqrt(losses.sum() / self.validation.counts.sum()))
@@ -265,7 +273,7 @@ class ModelSelection:
         if not choices:
             return []
         sets = [base + option.chosen for option in choices]
-        after = list(self.validation.losses_of(sets, [base] * len(sets)))
+        after = list(self.losses_of(sets, [base] * len(sets)))
         gains = np.array([self.log_ratio(before, losses) for losses in after])
         chances = sign_flip_p_values(
             self.problem.by_motion(gains), [option.effect for option in choices]
@@ -611,7 +619,7 @@ def _together(
     Few blocks that fall by much and many that fall by little both count. The noise is added to
     both, and amplitudes have their price. common: as of `CrossValidation.losses_of`.
     """
-    losses, floor = selection.validation.losses_of(sets, common), selection.floor.sum()
+    losses, floor = selection.losses_of(sets, common), selection.floor.sum()
     whole = np.log((null.sum() + floor) / (losses.sum(axis=1) + floor))
     gains = selection.log_ratio(null, losses).mean(axis=1) + whole
     return [SEARCH.priced(float(gain), len(each)) for gain, each in zip(gains, sets, strict=True)]

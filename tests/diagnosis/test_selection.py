@@ -46,6 +46,9 @@ class Table:
         share = rng.uniform(0.9, 1.1, 40)
         return self.loss["".join(str(p) for p in sorted(set(chosen)))] * share / 40
 
+    def losses_of(self, sets, common=None):
+        return np.array([self.losses(each) for each in sets]).reshape(len(sets), 40)
+
     def excess(self, losses):
         return float(losses.sum() - 1.0)
 

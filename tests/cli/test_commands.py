@@ -15,6 +15,13 @@ from rich.text import Text
 from surgisoft.cli import MANY, command_line, run, spread
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import load_recording
+from tests.few_effects import few_effects
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_effects():
+    with few_effects("creep", "payload"):
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -20,6 +20,7 @@ from surgisoft.scene.meshio import write_ply
 from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
 from surgisoft.surrogate.effects import make_effect, register_effect_file, user_defined
 from surgisoft.surrogate.model import ArmModel
+from tests.few_effects import few_effects
 from tests.scene.shapes import ball
 from tests.surrogate.effects.test_user_defined import EXAMPLE
 
@@ -99,6 +100,12 @@ COMMANDS = {
 
 NEXT = {"compare": 1, "amend": 1, "train": 1}
 """Lines with the command to run next that these always print."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_effects():
+    with few_effects("creep", "line_lag", "payload"):
+        yield
 
 
 @pytest.fixture(scope="module")

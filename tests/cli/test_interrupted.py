@@ -18,7 +18,13 @@ import surgisoft.diagnosis.diagnose
 from surgisoft.cli import run
 from surgisoft.files import noted_writes, write_atomically
 from surgisoft.surrogate.checkpoint import load_model
-from surgisoft.surrogate.effects import EFFECTS
+from tests.few_effects import few_effects
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_effects():
+    with few_effects("creep", "line_lag", "payload"):
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -200,10 +206,9 @@ def moving(tmp_path_factory):
 def test_ctrl_c_in_a_refit_keeps_the_verdict_of_the_residuals(
     moving, tmp_path, monkeypatch, capsys
 ):
-    """With three candidates, and in this process: `tests/test_workers.py` has pools that end."""
+    """In this process: `tests/test_workers.py` has pools that end."""
     monkeypatch.setattr(surgisoft.cli.diagnose, "REFIT_PROCESSES", 1)
-    others = " ".join(name for name in EFFECTS if name not in ("creep", "line_lag", "payload"))
-    command = f"diagnose default {moving} --without {others} --refit"
+    command = f"diagnose default {moving} --refit"
     assert run([*command.split(), "never", "--json", str(tmp_path / "never.json")]) == 0
     alone = json.loads((tmp_path / "never.json").read_text())
     sentence = alone["verdict"]["sentence"]

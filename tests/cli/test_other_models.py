@@ -20,8 +20,15 @@ from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.callables import named
 from surgisoft.surrogate.checkpoint import load_model, save_model
 from tests.cli.test_printed import diagnosis, result
+from tests.few_effects import few_effects
 from tests.replay.reading import entities
 from tests.test_your_model import blocks
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_effects():
+    with few_effects("creep", "line_lag", "payload"):
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ import csv
 import inspect
 import json
 import re
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -14,7 +13,6 @@ import pytest
 from surgisoft.agents.on_rig import RigConfig
 from surgisoft.agents.session import EvaluationRequest, evaluate
 from surgisoft.cli import run
-from surgisoft.diagnosis import improve as improving
 from surgisoft.diagnosis.amend import amend
 from surgisoft.diagnosis.compare import compare
 from surgisoft.diagnosis.design.next_experiment import next_experiment
@@ -34,20 +32,22 @@ from surgisoft.rig.trial import collect
 from surgisoft.scene.author import Request
 from surgisoft.scene.spec import LimitsSpec
 from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
-from surgisoft.surrogate.effects import EFFECTS
 from surgisoft.surrogate.fit import FitConfig
+from tests.few_effects import few_effects
 from tests.replay.reading import entities, values_of
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-
-CANDIDATES = ("payload", "misalignment", "creep", "drift", "line_lag")
-OTHERS = tuple(name for name in EFFECTS if name not in CANDIDATES)
-"""Effects that cannot act on the turned bench: a diagnosis of fewer candidates is quicker."""
 
 
 def python_snippets(page: str) -> list[str]:
     """The Python blocks of a page of the documentation."""
     return re.findall(r"^```python\n(.*?)^```", (DOCS / page).read_text(), re.S | re.M)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_effects():
+    with few_effects("creep", "drift", "payload", "misalignment"):
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -111,9 +111,8 @@ def test_a_turned_bench_gives_one_result_everywhere(lab, capsys):
     arm, data = str(lab / "arm"), str(lab / "turned.parquet")
     compared, _ = compare(arm, data)
     assert as_written(compared) == of_command(lab, "compare", arm, data)
-    diagnosed = diagnose(arm, [data], without=OTHERS)
-    given = ["diagnose", arm, data, "--without", *OTHERS]
-    assert as_written(diagnosed) == of_command(lab, *given)
+    diagnosed = diagnose(arm, [data])
+    assert as_written(diagnosed) == of_command(lab, "diagnose", arm, data)
     assert diagnosed.ranking[0].effect == "payload"
     amended = amend(arm, data, ["payload"])
     new = ["-o", str(lab / "new"), "--force"]
@@ -130,9 +129,7 @@ def test_a_turned_bench_gives_one_result_everywhere(lab, capsys):
     assert warned.count("35 degrees") == 3
 
 
-def test_improve_gives_one_result(lab, monkeypatch):
-    """Each of its diagnoses has the candidates of CANDIDATES alone."""
-    monkeypatch.setattr(improving, "diagnose", partial(diagnose, without=OTHERS))
+def test_improve_gives_one_result(lab):
     improved = improve(lab / "arm", lab / "turned.parquet", 1)
     command = ["improve", str(lab / "arm"), str(lab / "turned.parquet"), "--max-effects", "1"]
     page = ["--report", str(lab / "story"), "--replay", str(lab / "story.rrd")]

@@ -13,6 +13,7 @@ a function or under TYPE_CHECKING too); `surgisoft` itself, which hands names on
 import ast
 import sys
 from collections import defaultdict
+from functools import cache
 from pathlib import Path
 
 import networkx
@@ -31,11 +32,25 @@ def modules(root: Path) -> dict[str, Path]:
     return found
 
 
+@cache
+def imports(path: Path) -> list[ast.Import | ast.ImportFrom]:
+    """The imports of a file, in functions too; no expression holds one, so none is searched."""
+    found: list[ast.Import | ast.ImportFrom] = []
+    waiting: list[ast.AST] = [ast.parse(path.read_text())]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            found.append(node)
+        for field in ("body", "orelse", "finalbody", "handlers", "cases"):
+            waiting += getattr(node, field, ())
+    return found
+
+
 def importers(known: dict[str, Path]) -> dict[str, set[str]]:
     """Name of each module -> names of the modules of the package that import it."""
     result: dict[str, set[str]] = defaultdict(set)
     for name, path in known.items():
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in imports(path):
             targets = []
             if isinstance(node, ast.ImportFrom) and node.module:
                 for alias in node.names:

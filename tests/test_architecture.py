@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.structure import circles, importers, modules
+from benchmarks.structure import circles, importers, imports, modules
 from surgisoft.surrogate.effects import EFFECTS
 from surgisoft.tasks.world.random_effects import KINDS as RANDOM_EFFECTS
 
@@ -171,10 +171,10 @@ ONLY_IN = {
 @cache
 def _imports(path: Path) -> set[str]:
     names = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in imports(path):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
+        else:
             assert node.level == 0, f"{path}: relative import"
             names.add(node.module)
             names |= {f"{node.module}.{alias.name}" for alias in node.names}

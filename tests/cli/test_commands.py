@@ -271,27 +271,29 @@ def test_old_names_of_options_still_work_and_are_not_shown(tmp_path, capsys):
     assert spread(["benchmark", "x", "--specimen", "1"])[2] == "--specimen"
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        "compare nowhere x.csv",
-        "compare default x.csv",
-        "diagnose default x.csv",
-        "improve default x.csv -o new",
-        "amend default --effect creep --data x.csv -o new",
-        "next-experiment nowhere",
-        "fit x.csv -o new",
-        "scene new nope.stl -o new",
-    ],
-)
-def test_a_missing_file_is_reported_before_pytorch_is_loaded(command, tmp_path):
+BEFORE_PYTORCH = [
+    "compare nowhere x.csv",
+    "compare default x.csv",
+    "diagnose default x.csv",
+    "improve default x.csv -o new",
+    "amend default --effect creep --data x.csv -o new",
+    "next-experiment nowhere",
+    "fit x.csv -o new",
+    "scene new nope.stl -o new",
+]
+"""Commands with a file that is not there."""
+
+
+def test_a_missing_file_is_reported_before_pytorch_is_loaded(tmp_path):
+    """One program runs the commands, one after another."""
     code = (
-        "import sys; from surgisoft.cli import run;"
-        "code = run(sys.argv[1:]); print(code, 'torch' in sys.modules)"
+        "import sys; from surgisoft.cli import run\n"
+        "for command in sys.argv[1:]:\n"
+        "    print(command, run(command.split()), 'torch' in sys.modules, sep=': ')"
     )
-    words = [sys.executable, "-c", code, *command.split()]
+    words = [sys.executable, "-c", code, *BEFORE_PYTORCH]
     done = subprocess.run(words, capture_output=True, text=True, check=True, cwd=tmp_path)
-    assert done.stdout.split() == ["2", "False"], done.stderr
+    assert done.stdout.splitlines() == [f"{each}: 2: False" for each in BEFORE_PYTORCH], done.stderr
 
 
 def test_a_table_without_orientations_needs_no_rotations_of_scipy(tmp_path):

@@ -10,6 +10,7 @@ from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.callables import named
+from tests.few_effects import few_effects
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "your_model.md"
 
@@ -38,7 +39,8 @@ def test_the_snippets_run_as_they_stand(tmp_path, monkeypatch, capsys):
         if name:
             Path(name).write_text(text)
     result: dict = {}
-    exec(parts[""], result)
+    with few_effects("payload", "creep", "misalignment"):
+        exec(parts[""], result)
     monkeypatch.delitem(sys.modules, "my_arm", raising=False)
     assert "payload" in result["amended"].model.effects
     assert result["key_points"].shape == (64, 5, 3)

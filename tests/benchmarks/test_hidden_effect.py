@@ -23,6 +23,7 @@ from surgisoft.progress import Stages
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, save_model
 from surgisoft.tasks.registry import config_of, with_fields
+from tests.few_effects import few_effects
 
 SMALL = StudyConfig(steps=3072, episodes=2, samples=1600)
 
@@ -104,7 +105,7 @@ def brief(patch):
 def payload(tmp_path_factory):
     """The outcome of a payload with policies that hardly learned anything, and its folder."""
     folder = tmp_path_factory.mktemp("study")
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, few_effects("payload", "creep", "misalignment"):
         brief(patch)
         yield run(["payload"], SMALL, folder, nothing)[0], folder
 

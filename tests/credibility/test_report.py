@@ -19,6 +19,7 @@ from surgisoft.experiments.results import sum_up
 from surgisoft.experiments.run import run_experiment
 from surgisoft.experiments.session import start_experiment
 from tests.experiments import tiny
+from tests.few_effects import few_effects
 from tests.report.browser import chromium, look
 
 CONTEXT = """
@@ -45,6 +46,12 @@ date = "2026-11-22"
 [scenario]
 states = ["a.parquet"]
 """
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_effects():
+    with few_effects("payload", "creep", "misalignment"):
+        yield
 
 
 @pytest.fixture(scope="module")

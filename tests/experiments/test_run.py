@@ -102,6 +102,9 @@ def test_tables_hold_every_episode(whole):
     assert load_experiment(folder / "experiment.toml").repeats == 3
 
 
+BRIEF = TINY.replace("repeats = 3", "repeats = 2").replace("time_s = 0.5", "time_s = 0.2")
+"""Two episodes of two steps."""
+
 THREE_TIMES = """
 [[vary]]
 field = "task.cut_s"
@@ -111,7 +114,7 @@ values = [30.0, 40.0, 50.0]
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_setting_whose_code_raises_leaves_the_others_their_report(tmp_path, monkeypatch, capsys):
-    text = TINY.replace("repeats = 3", "repeats = 2").replace("together = 1", "together = 2")
+    text = BRIEF.replace("together = 1", "together = 2")
     file, folder = write(tmp_path, text + THREE_TIMES), tmp_path / "r"
     play, broken = experiment_run.roll_out_block, ["simulation_cut_s=40"]
 
@@ -143,7 +146,7 @@ def test_a_setting_whose_code_raises_leaves_the_others_their_report(tmp_path, mo
 
 def test_a_setting_of_which_a_block_fails_is_left_out_whole(tmp_path, monkeypatch):
     """Two blocks of one episode each; the second one of the first setting raises."""
-    text = TINY.replace("repeats = 3", "repeats = 2") + THREE_TIMES
+    text = BRIEF + THREE_TIMES
     spec, folder = load_experiment(write(tmp_path, text)), tmp_path / "r"
     play = experiment_run.roll_out_block
 

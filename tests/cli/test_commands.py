@@ -35,7 +35,7 @@ def lab(tmp_path_factory):
         run(
             [
                 "fit", str(folder / "walk.parquet"), "--valid", str(folder / "validation.parquet"),
-                "--effects", "hysteresis", "--prior", "none", "--epochs", "50",
+                "--effects", "hysteresis", "--prior", "none", "--epochs", "25",
                 "--widths", "48,48", "-o", str(folder / "arm"),
             ]
         )
@@ -59,7 +59,7 @@ def test_fitted_arm_beats_pressure_alone(lab, capsys):
         run(
             [
                 "fit", str(lab / "walk.parquet"), "--valid", str(lab / "validation.parquet"),
-                "--inputs", "pressure", "--prior", "none", "--epochs", "50",
+                "--inputs", "pressure", "--prior", "none", "--epochs", "25",
                 "--widths", "48,48", "-o", plain,
             ]
         )

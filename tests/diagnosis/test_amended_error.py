@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from surgisoft.diagnosis.amend import amend
+from surgisoft.diagnosis.amend import Amendment, amend
 from surgisoft.diagnosis.improve import improve
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.training import validated_error
+from tests.diagnosis.few_effects import choose_among
 from tests.diagnosis.test_estimation import NOISE_MM, TRUTHS, bare_arm, measured_on
 
 FLOOR_MM = np.sqrt(3.0) * NOISE_MM
@@ -41,17 +42,27 @@ def of(truth: ArmModel, seed: int, kind: str) -> Recording:
     return replace(plain, key_points_mm=points + noise)
 
 
+@pytest.fixture(scope="module")
+def amended() -> tuple[ArmModel, Amendment]:
+    """An arm that was fitted to one that creeps, and its amendment."""
+    arm = fitted_to(TRUTHS["creep"])
+    recorded = measured_on(TRUTHS["creep"], seed=1)
+    return arm, amend(arm, [recorded], "creep", refit="never")
+
+
 @pytest.mark.parametrize("step", ["amend", "improve"])
-def test_an_effect_that_the_fit_lacked_takes_its_part_of_the_stated_error_away(step):
+def test_an_effect_that_the_fit_lacked_takes_its_part_of_the_stated_error_away(
+    step, amended, monkeypatch
+):
     truth = TRUTHS["creep"]
-    arm = fitted_to(truth)
+    arm, found = amended
+    if step == "improve":
+        choose_among(monkeypatch, "gain_mismatch", "creep", "payload")
+        arm = fitted_to(truth)
     stated = arm.validation
     assert stated.rmse_mm > 3 * FLOOR_MM
-    recorded = measured_on(truth, seed=1)
-    if step == "amend":
-        found = amend(arm, [recorded], "creep", refit="never")
-    else:
-        found = improve(arm, [recorded], refit="never")
+    if step == "improve":
+        found = improve(arm, [measured_on(truth, seed=1)], refit="never")
     error = found.model.validation
     # On the held-out rows the noise is left, and the model states no less.
     assert found.held_out.after == pytest.approx(FLOOR_MM, rel=0.03)
@@ -86,7 +97,8 @@ def test_runs_of_the_fit_begin_where_they_began(actuation, kind):
 
 def test_an_arm_that_changed_since_the_fit_leaves_the_stated_error_as_it_is():
     arm = fitted_to(bare_arm())
-    found = amend(arm, [measured_on(TRUTHS["creep"], seed=1)], "creep", refit="never")
+    changed = measured_on(TRUTHS["gain_mismatch"], seed=1)
+    found = amend(arm, [changed], "gain_mismatch", refit="never")
     assert found.claimed
     assert found.model.validation == arm.validation
     assert found.model.training_residuals is arm.training_residuals
@@ -111,18 +123,17 @@ def test_no_key_point_states_less_than_its_error_on_the_held_out_rows():
 
 
 def test_without_the_actuation_before_its_rows_nothing_is_restated():
-    arm = fitted_to(TRUTHS["creep"])
+    arm, truth = fitted_to(TRUTHS["gain_mismatch"]), TRUTHS["gain_mismatch"]
     known = arm.training_residuals
     for past in (None, replace(known.past, stood=None)):
         arm.training_residuals = replace(known, past=past)
-        found = amend(arm, [measured_on(TRUTHS["creep"], seed=1)], "creep", refit="never")
+        found = amend(arm, [measured_on(truth, seed=1)], "gain_mismatch", refit="never")
         assert found.claimed
         assert found.model.validation.rmse_mm == arm.validation.rmse_mm
 
 
-def test_what_is_restated_is_kept_in_the_folder(tmp_path):
-    arm = fitted_to(TRUTHS["creep"])
-    found = amend(arm, [measured_on(TRUTHS["creep"], seed=1)], "creep", refit="never")
+def test_what_is_restated_is_kept_in_the_folder(tmp_path, amended):
+    found = amended[1]
     save_model(found.model, tmp_path / "arm", found.to_json())
     back = load_model(tmp_path / "arm")
     assert back.validation.rmse_mm == pytest.approx(found.model.validation.rmse_mm)

@@ -14,6 +14,7 @@ from surgisoft.diagnosis.selection import best_achievable
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import load_model
+from tests.diagnosis.few_effects import choose_among
 from tests.diagnosis.synthetic import (
     NOISE_MM,
     backlash,
@@ -91,8 +92,11 @@ def resting(rows: int):
     ],
     ids=["two recordings of a leak", "noise from holds", "second differences"],
 )
-def test_compare_and_diagnose_give_one_floor_and_one_best_achievable_error(model, recorded, source):
+def test_compare_and_diagnose_give_one_floor_and_one_best_achievable_error(
+    model, recorded, source, monkeypatch
+):
     """As both commands are called; nothing that is reported is below it, and the share fits it."""
+    choose_among(monkeypatch, "gain_mismatch", "hysteresis", "creep", "payload")
     model, made = still_model() if model is None else load_model(model), recorded()
     found = diagnose(model, made)
     result, table = compare(model, made)

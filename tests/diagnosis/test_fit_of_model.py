@@ -14,6 +14,7 @@ from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.surrogate.checkpoint import default_arm
 from surgisoft.surrogate.model import Validation
+from tests.diagnosis.few_effects import choose_among
 from tests.diagnosis.setup.recordings import NOISE_MM, measured, predicted, with_points
 from tests.diagnosis.synthetic import recording, still_model, walk
 from tests.diagnosis.test_estimation import bare_arm, measured_on
@@ -44,8 +45,9 @@ def test_a_model_of_this_arm_predicts_most_of_its_motion(model, share, fits):
     assert found.fits is fits
 
 
-def test_compare_says_that_a_model_does_not_describe_an_arm(model, tmp_path, capsys):
+def test_compare_says_that_a_model_does_not_describe_an_arm(model, tmp_path, capsys, monkeypatch):
     """What an error depends on says nothing where the model leaves most of the motion."""
+    choose_among(monkeypatch, "gain_mismatch", "creep", "payload")
     whole = predicted(800)
     motion = fit_of_model(model, [whole]).motion_mm
     (own, _), (away, _) = (

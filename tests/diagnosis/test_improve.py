@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from surgisoft.cli import run
-from surgisoft.diagnosis import diagnose as diagnosing
 from surgisoft.diagnosis import improve as loop
 from surgisoft.diagnosis.amend import Fall
 from surgisoft.diagnosis.decision import Probabilities
@@ -28,8 +27,8 @@ from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.report import Text
 from surgisoft.surrogate.checkpoint import load_model, save_model
-from surgisoft.surrogate.effects import known_effects
 from surgisoft.surrogate.model import ArmModel
+from tests.diagnosis.few_effects import choose_among
 from tests.diagnosis.synthetic import NOISE_MM
 from tests.diagnosis.test_estimation import TRUTHS, bare_arm, measured_on, with_truth
 from tests.diagnosis.test_estimation import rms as rms_distance
@@ -43,9 +42,7 @@ def said(kind: str, *effects: str) -> Diagnosis:
 @pytest.fixture
 def few_candidates(monkeypatch):
     """Diagnoses choose among five effects, of every stage, to save time."""
-    names = ("line_lag", "gain_mismatch", "creep", "payload", "misalignment")
-    some = {name: known_effects()[name] for name in names}
-    monkeypatch.setattr(diagnosing, "known_effects", lambda: some)
+    choose_among(monkeypatch, "line_lag", "gain_mismatch", "creep", "payload", "misalignment")
 
 
 @pytest.fixture

@@ -51,11 +51,19 @@ from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, save_model
 from surgisoft.surrogate.model import Validation
 from surgisoft.surrogate.training_residuals import Past
+from tests.diagnosis.few_effects import choose_among
 from tests.diagnosis.synthetic import NOISE_MM, PERIOD_S, POINTS, recording, still_model, walk
 
 ROWS = 2400
 SMOOTHNESS = 25
 """Rows over which the actuation of these tests is averaged: it has a slope everywhere."""
+
+
+@pytest.fixture(autouse=True)
+def few_effects(monkeypatch):
+    """Diagnoses choose among six effects, to save time."""
+    some = ("gain_mismatch", "line_lag", "creep", "rate_dependence", "payload", "misalignment")
+    choose_among(monkeypatch, *some)
 
 
 @pytest.fixture(scope="module")
@@ -594,7 +602,7 @@ def rig_takes():
     takes = []
     for take, hidden in ((1, ()), (2, (("payload", 1.5),))):
         rig = VirtualRig(0, take=take, hidden=hidden)
-        takes.append(rig.record(make_protocol("mixed", rig.limits, 1500, seed=5))[0])
+        takes.append(rig.record(make_protocol("mixed", rig.limits, 1000, seed=5))[0])
     before, after = takes
     columns = ("measured", "key_points_mm", "commanded", "run", "temp_C")
     cut = {name: getattr(after, name)[50:] for name in columns}
@@ -1098,7 +1106,7 @@ def test_what_the_model_lacked_before_the_change_is_said(own):
     takes = []
     for take, hidden in ((1, ()), (2, (("payload", 1.5),))):
         rig = VirtualRig(0, take=take, hidden=(*own, *hidden))
-        takes.append(rig.record(make_protocol("mixed", rig.limits, 1500, seed=5))[0])
+        takes.append(rig.record(make_protocol("mixed", rig.limits, 1000, seed=5))[0])
     before, after = takes
     notes = amend(default_arm(), [after], "payload", before=[before], retune_network=False).notes
     if not own:

@@ -50,6 +50,7 @@ from surgisoft.measurement.recordings import Recording, save_recording
 from surgisoft.surrogate.checkpoint import save_model
 from surgisoft.surrogate.effects import Memoryless, known_effects, make_effect
 from surgisoft.surrogate.model import ArmModel, Validation
+from tests.diagnosis.few_effects import all_but, choose_among
 
 PERIOD_S, LAG_S, NOISE_MM = 0.1, 0.4, 0.1
 SHORT = RefitConfig(rows=800, seeds=2, early_epochs=1, first_epochs=2, epochs=3, finalists=2)
@@ -104,11 +105,6 @@ def fitted_to(recording: Recording, **more) -> ArmModel:
     return fit([recording], **(given | more)).model
 
 
-def only(*effects):
-    """What is left out so that these effects alone are tried."""
-    return [name for name in known_effects() if name not in effects]
-
-
 @pytest.fixture(scope="module")
 def lagging():
     """A recording of the lagging arm, and a network that was fitted to it without the lag."""
@@ -131,7 +127,7 @@ def found(problem):
 def unasked(lagging):
     """A diagnosis of the lagging arm among three effects, which may not refit."""
     recording, model = lagging
-    without = only("line_lag", "creep", "payload")
+    without = all_but("line_lag", "creep", "payload")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(diagnosing, "fit_candidates_together", None)
         return diagnosing.diagnose(model, [recording], refit="never", without=without)
@@ -142,8 +138,7 @@ def short(monkeypatch):
     """The commands with a budget of seconds and one candidate, in this process; residuals are
     explained by one of three effects."""
     monkeypatch.setattr(refitting, "hideable", lambda *given: (["line_lag"], {}))
-    some = {name: known_effects()[name] for name in ("line_lag", "creep", "payload")}
-    monkeypatch.setattr(diagnosing, "known_effects", lambda: some)
+    choose_among(monkeypatch, "line_lag", "creep", "payload")
     made = []
 
     def once(problem, *given, **more):
@@ -221,7 +216,7 @@ def test_a_training_that_came_out_badly_names_no_effect(monkeypatch):
 
     monkeypatch.setattr(refitting, "run_job", unlucky)
     clean = identification_problem(model, [recording])
-    found = refit(clean, without=only("softening", "rate_dependence", "inertia"), config=SHORT)
+    found = refit(clean, without=all_but("softening", "rate_dependence", "inertia"), config=SHORT)
     candidates, finalists, checked = 3, 2, 1
     assert found.trainings == SHORT.seeds * (candidates + 1 + finalists + 1 + checked)
     assert found.winner is None
@@ -269,7 +264,7 @@ def test_the_score_of_a_candidate_by_hand(problem, monkeypatch):
     """2 mm of the network alone and 1 mm with creep in every one of 20 blocks, of which half were
     left out by each of two trainings; the noise counts beside both."""
     jobs = with_errors(monkeypatch, {None: 2.0, "creep": 1.0})
-    found = refit(problem, without=only("creep"), config=SHORT)
+    found = refit(problem, without=all_but("creep"), config=SHORT)
     (row,) = found.candidates
     noise = problem.floor_mm**2
     assert (found.unit, found.units) == ("blocks of time", 20)
@@ -291,7 +286,7 @@ def test_an_interval_and_a_spread_come_from_blocks_and_from_seeds(problem, monke
     """Creep leaves 1 mm in one part and half a millimetre in the other."""
     part = Split.of(problem, SHORT).part
     with_errors(monkeypatch, {None: 2.0, "creep": np.where(part == 0, 1.0, 0.5)})
-    (row,) = refit(problem, without=only("creep"), config=SHORT).candidates
+    (row,) = refit(problem, without=all_but("creep"), config=SHORT).candidates
     assert row.seeds_mm == pytest.approx((1.0, 0.5))
     assert row.spread_mm == pytest.approx(0.5 / np.sqrt(2.0))
     low, high = row.ci95_mm
@@ -335,7 +330,7 @@ def test_who_wins_and_who_competes(problem, monkeypatch, errors, winner, competi
     four fifths of the gain or more. A line's lag is that of a command. A gain has to be large and
     in more blocks than chance gives."""
     with_errors(monkeypatch, {None: 2.0, **errors})
-    found = refit(problem, without=only(*errors), config=SHORT)
+    found = refit(problem, without=all_but(*errors), config=SHORT)
     assert (found.winner, found.competing, found.of_line) == (winner, competing, of_line)
     assert found.ambiguous is bool(competing and not of_line)
     assert (found.confidence > 0.0) == (winner is not None)
@@ -347,14 +342,14 @@ def test_an_effect_beyond_plausibility_in_one_training_is_not_named(problem, mon
     """Neither is it trained on in the place of another one: two of three are, for longer."""
     errors = {None: 2.0, "creep": 0.4, "softening": 0.7, "inertia": 1.0}
     jobs = with_errors(monkeypatch, errors, implausible=[("creep", 1)])
-    found = refit(problem, without=only("creep", "softening", "inertia"), config=SHORT)
+    found = refit(problem, without=all_but("creep", "softening", "inertia"), config=SHORT)
     assert not found.of("creep").plausible
     assert not found.of("creep").named
     assert found.winner == "softening"
     last = {job.effects for job in jobs if job.epochs == SHORT.epochs}
     assert last == {(), ("softening",), ("inertia",)}
     jobs = with_errors(monkeypatch, errors)
-    refit(problem, without=only("creep", "softening", "inertia"), config=SHORT)
+    refit(problem, without=all_but("creep", "softening", "inertia"), config=SHORT)
     last = {job.effects for job in jobs if job.epochs == SHORT.epochs}
     assert last == {(), ("creep",), ("softening",)}, "the best ones"
 
@@ -528,7 +523,7 @@ def test_a_clean_model_at_its_floor_costs_nothing(monkeypatch):
         raise AssertionError("a refit was started")
 
     monkeypatch.setattr(diagnosing, "fit_candidates_together", refuse)
-    without = only("line_lag", "hysteresis", "creep", "rate_dependence")
+    without = all_but("line_lag", "hysteresis", "creep", "rate_dependence")
     assert diagnosing.diagnose(model, [recording], without=without).refit is None
 
 
@@ -556,7 +551,7 @@ def test_what_the_network_has_learned_leads_to_a_refit(
     none = replace(named(None, found), verdict=Verdict("cannot_tell", (), "why", 0.5, why))
     monkeypatch.setattr(diagnosing, "result_of", lambda findings: none)
     monkeypatch.setattr(diagnosing, "fit_candidates_together", lambda *given, **more: found)
-    given = {"setup_tests": False, "without": only("line_lag")}
+    given = {"setup_tests": False, "without": all_but("line_lag")}
     result = diagnosing.diagnose(off, [recording], refit=mode, **given)
     assert result.verdict.effects[:1] == effects
     assert (result.refit is found) == bool(effects)
@@ -578,7 +573,7 @@ def test_half_a_minute_of_motion_is_no_case_for_a_refit(lagging, found, monkeypa
     )
     monkeypatch.setattr(diagnosing, "result_of", lambda findings: none)
     monkeypatch.setattr(diagnosing, "fit_candidates_together", lambda *given, **more: found)
-    given = {"setup_tests": False, "without": only("line_lag")}
+    given = {"setup_tests": False, "without": all_but("line_lag")}
     auto, always = (
         diagnosing.diagnose(off, [replace(recording, **part)], refit=mode, **given)
         for mode in ("auto", "always")

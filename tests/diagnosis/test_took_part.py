@@ -22,6 +22,13 @@ from surgisoft.report import write_page
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.fitted_rows import FittedRows
+from tests.diagnosis.few_effects import choose_among
+
+
+@pytest.fixture(autouse=True)
+def few_effects(monkeypatch):
+    """Diagnoses choose among three effects, to save time."""
+    choose_among(monkeypatch, "gain_mismatch", "creep", "payload")
 
 
 def recorded(take: int, rows: int = 600) -> Recording:

@@ -1,5 +1,6 @@
-"""Recordings of an arm that moves as the default model predicts, and faults put into them."""
+"""Recordings of an arm that moves as a model predicts, and faults put into them."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 
@@ -10,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.recordings import ArmInfo, Recording
 from surgisoft.surrogate.checkpoint import default_arm
+from surgisoft.surrogate.model import ArmModel
 from tests.diagnosis.synthetic import walk
 
 NOISE_MM = 0.05
@@ -17,22 +19,27 @@ STEP_S = 0.1
 
 
 @lru_cache(maxsize=4)
-def predicted(rows: int = 2400, seed: int = 0, rests: int = 0) -> Recording:
-    """What the default model predicts for ramps and rests of all chambers, without noise.
+def predicted(
+    rows: int = 2400, seed: int = 0, rests: int = 0, arm: Callable[[], ArmModel] = default_arm
+) -> Recording:
+    """What a model predicts for ramps and rests of all chambers, without noise.
 
-    rests: number of last rows in which the first chamber rests at no pressure.
+    rests: number of last rows in which the first chamber rests at no pressure; arm: makes the
+    model.
     """
 
     def resting(actuation):
         actuation[rows - rests :, 0] = 0.0
         return actuation
 
-    return predicted_along(resting, rows, seed)
+    return predicted_along(resting, rows, seed, arm)
 
 
-def predicted_along(change, rows: int = 2400, seed: int = 0) -> Recording:
+def predicted_along(
+    change, rows: int = 2400, seed: int = 0, arm: Callable[[], ArmModel] = default_arm
+) -> Recording:
     """The same along another actuation (rows, 3), which `change` makes of the ramps and rests."""
-    model = default_arm()
+    model = arm()
     low, high = np.array(model.spec.low), np.array(model.spec.high)
     actuation = change(low + walk(rows, 3, seed) / 10.0 * (high - low))
     empty = Recording(
@@ -49,9 +56,14 @@ def predicted_along(change, rows: int = 2400, seed: int = 0) -> Recording:
     return replace(empty, key_points_mm=points)
 
 
-def measured(rows: int = 2400, seed: int = 0, noise_mm: float = NOISE_MM) -> Recording:
+def measured(
+    rows: int = 2400,
+    seed: int = 0,
+    noise_mm: float = NOISE_MM,
+    arm: Callable[[], ArmModel] = default_arm,
+) -> Recording:
     """The same motion, as cameras with white noise see it."""
-    true = predicted(rows, seed)
+    true = predicted(rows, seed, arm=arm)
     noise = np.random.default_rng(seed + 1).normal(0, noise_mm, true.key_points_mm.shape)
     return replace(true, key_points_mm=true.key_points_mm + noise, noise_mm=noise_mm)
 

@@ -7,13 +7,13 @@ import pytest
 
 from surgisoft.diagnosis.setup import find_setup_faults
 from surgisoft.diagnosis.setup.channels import dead_channels
-from surgisoft.surrogate.checkpoint import default_arm
-from tests.diagnosis.setup.recordings import measured, predicted, turned, with_points
+from tests.diagnosis.setup.recordings import turned, with_points
+from tests.diagnosis.small import measured, predicted, small_arm
 
 
 @pytest.fixture(scope="module")
 def model():
-    return default_arm()
+    return small_arm()
 
 
 def without_channel(recording, k, commanded=True):

@@ -9,15 +9,15 @@ import torch
 from surgisoft.diagnosis.setup import find_setup_faults
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.recordings import AlarmInfo
-from surgisoft.surrogate.checkpoint import default_arm
 from surgisoft.surrogate.effects.line_lag import LineLag
-from tests.diagnosis.setup.recordings import NOISE_MM, in_time, measured, with_points
+from tests.diagnosis.setup.recordings import NOISE_MM, in_time, with_points
+from tests.diagnosis.small import measured, small_arm
 
 
 @pytest.fixture(scope="module")
 def plain():
     """A model whose predictions do not depend on time: its hysteresis has no rate."""
-    return default_arm()
+    return small_arm()
 
 
 @pytest.fixture(scope="module")

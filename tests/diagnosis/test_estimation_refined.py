@@ -15,10 +15,12 @@ from surgisoft.diagnosis.selection import ModelSelection
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.checkpoint import default_arm
-from surgisoft.surrogate.effects import make_effect
+from surgisoft.surrogate.effects import EFFECTS, make_effect
 from tests.diagnosis.synthetic import backlash, walk
 
 PERIOD_S, SUBSTEPS, NOISE_MM = 0.05, 20, 0.05
+RIVALS = ("line_lag", "rate_dependence", "hysteresis", "inertia", "creep", "gain_mismatch")
+"""A lag of the lines, and what may be taken for it."""
 
 
 def lagged(signal: np.ndarray, time_s: float) -> np.ndarray:
@@ -81,13 +83,14 @@ def test_a_backlash_beside_the_plays_of_the_model_is_hysteresis():
     low, high = np.array(default_arm().spec.low), np.array(default_arm().spec.high)
     commands = low + (0.1 + 0.05 * walk(3000, 3)) * (high - low)
     behind = np.stack([backlash(column, 1.0) for column in commands.T], axis=1)
-    found = diagnose(default_arm(), [made(commands, behind)])
+    found = diagnose(default_arm(), [made(commands, behind)], setup_tests=False, refit="never")
     assert found.verdict.effects == ("hysteresis",)
     assert found.ranking[0].gain_alone > 0.8
 
 
 def test_a_lag_before_the_plays_is_no_viscosity_behind_them(lagging, monkeypatch):
-    found = diagnose(default_arm(), [lagging])
+    others = [name for name in EFFECTS if name not in RIVALS]
+    found = diagnose(default_arm(), [lagging], without=others, setup_tests=False, refit="never")
     assert found.ranking[0].effect == "line_lag"
     assert found.verdict.effects[:1] == ("line_lag",)
     (fine_mm,) = (row.heldout_rmse_mm for row in found.ranking if row.effect == "line_lag")

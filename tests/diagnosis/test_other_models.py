@@ -31,6 +31,8 @@ from surgisoft.surrogate.callables.named import given_callable
 from surgisoft.surrogate.checkpoint import default_arm
 from surgisoft.surrogate.effects import make_effect
 from surgisoft.surrogate.history import pack
+from tests.diagnosis.setup.recordings import NOISE_MM
+from tests.diagnosis.small import measured, small_arm
 
 ARM = default_arm()
 
@@ -116,7 +118,7 @@ def test_the_diagnosis_is_that_of_the_arm(loaded, with_file):
     residuals of its fit, which no model of other origin has."""
     bare = default_arm()
     bare.training_residuals = None
-    truth = diagnose(bare, loaded, setup_tests=False)
+    truth = diagnose(bare, loaded, setup_tests=False, refit="never")
     found = diagnose(by_file(with_file), with_file)
     assert found.setup is None
     assert found.ranking[0].effect == truth.ranking[0].effect == "payload"
@@ -176,7 +178,7 @@ def test_the_validated_error_comes_from_before(loaded):
 def test_a_slow_callable_is_told_once_with_what_it_will_take(static, loaded, monkeypatch):
     class Slow:
         def __call__(self, time_s, actuation):
-            time.sleep(0.0 if len(actuation) == 1 else 0.25)
+            time.sleep(0.0 if len(actuation) == 1 else 0.1)
             return np.zeros((len(actuation), 5, 3))
 
     def told(model):
@@ -189,12 +191,12 @@ def test_a_slow_callable_is_told_once_with_what_it_will_take(static, loaded, mon
     slow = Slow()
     slow.static = static
     assert told(slow) == []
-    monkeypatch.setattr(network, "SLOW_S", 0.25)
-    monkeypatch.setattr(network, "EVALUATIONS", 720)
+    monkeypatch.setattr(network, "SLOW_S", 0.1)
+    monkeypatch.setattr(network, "EVALUATIONS", 1800)
     first, second = told(slow)
     assert first.split(" took ")[0] == second.split(" took ")[0]
     assert f"for {len(loaded.t_s)} rows" in first
-    # 720 evaluations of 0.25 s are 3 min; a busy machine may take longer.
+    # 1,800 evaluations of 0.1 s are 3 min; a busy machine may take longer.
     assert 3 <= int(re.search(r"may take (\d+) min", first)[1]) < 60
 
 
@@ -278,10 +280,23 @@ def test_the_stated_length_tells_whose_unit_is_wrong(loaded):
     callable_arm(given_callable(scaled(1e-3)), [with_length(loaded, None)])
 
 
-def test_the_set_up_tests_leave_open_whose_unit_is_wrong_only_where_no_length_tells(loaded):
+def single_rows(time_s, actuation):
+    """The network of the small arm without directions, as a callable of single rows."""
+    signal = torch.from_numpy(actuation).float()
+    with torch.no_grad():
+        return small_arm().network(signal, torch.zeros_like(signal)).double().numpy()
+
+
+single_rows.static = True
+
+
+def test_the_set_up_tests_leave_open_whose_unit_is_wrong_only_where_no_length_tells():
     """The recording is in cm; without a length the model may be ten times too large."""
-    right = callable_arm(given_callable(whole_runs), [loaded])
-    in_cm = replace(loaded, key_points_mm=loaded.key_points_mm / 10)
+    made = measured(800)
+    noise = np.random.default_rng(2).normal(0.0, NOISE_MM, made.key_points_mm.shape)
+    made = replace(made, key_points_mm=single_rows(made.t_s, made.measured) + noise)
+    right = callable_arm(given_callable(single_rows), [made], error_mm=0.1)
+    in_cm = replace(made, key_points_mm=made.key_points_mm / 10)
     told = find_setup_faults(right, [in_cm])
     assert told.kinds == ("length_unit",)
     assert told.of_model == ""

@@ -23,9 +23,9 @@ def unlearned(pressure):
     return 2.0 * np.sin(2.5 * a) + 1.5 * np.cos(3.0 * b) * a
 
 
-def measured(seed, shifted_mm=0.0):
+def measured(seed, shifted_mm=0.0, rows=ROWS):
     """The arm's recording; the whole of it moved sideways since, as a turned camera sees it."""
-    pressure = walk(ROWS, seed=seed)
+    pressure = walk(rows, seed=seed)
     points = POINTS + np.array([0.0, shifted_mm, 0.0])
     return recording(unlearned(pressure), pressure, points, seed=seed)
 
@@ -38,15 +38,15 @@ def model():
 
 
 def test_what_was_there_before_is_not_named(model):
-    found = diagnose(model, [measured(1)], reference=[measured(2)])
+    found = diagnose(model, [measured(1)], reference=[measured(2)], setup_tests=False)
     assert found.verdict.effects == ()
 
 
 def test_what_has_changed_is_named(model):
     """A shift of the size of the network's error, which may be its own without a reference."""
     now = measured(1, shifted_mm=1.0)
-    alone = diagnose(model, [now])
-    since = diagnose(model, [now], reference=[measured(2)])
+    alone = diagnose(model, [now], setup_tests=False)
+    since = diagnose(model, [now], reference=[measured(2)], setup_tests=False)
     assert since.verdict.effects[0] == "misalignment"
     assert since.verdict.confidence > alone.probabilities.effects["misalignment"] + 0.1
     gain = {row.effect: row.gain_alone for row in since.ranking}["misalignment"]
@@ -103,12 +103,17 @@ def test_a_fitted_model_keeps_where_it_is_off(tmp_path):
     from surgisoft.surrogate.checkpoint import load_model, load_training_residuals
     from surgisoft.surrogate.fit import FitConfig, fit
 
-    before = measured(2)
-    result = fit(history_of([before]), None, arm_spec([before]), FitConfig(hidden=(8,), epochs=10))
+    before = measured(2, rows=1000)
+    result = fit(
+        history_of([before]),
+        None,
+        arm_spec([before]),
+        FitConfig(hidden=(8,), epochs=10, prior="none"),
+    )
     save_model(result.model, tmp_path / "arm", known=result.known)
     known, model = load_training_residuals(tmp_path / "arm"), load_model(tmp_path / "arm")
     history = history_of([before])
-    step = ROWS // len(known.residual_mm)
+    step = before.samples // len(known.residual_mm)
     np.testing.assert_array_equal(known.actuation, history.pressure[0, ::step])
     off = before.key_points_mm - model.predict(history)[0].numpy()
     np.testing.assert_allclose(known.residual_mm, off[::step], atol=1e-4)

@@ -48,8 +48,8 @@ def residual(seconds, seed, sd_mm=0.1, correlation_s=3.0, noise_mm=0.03):
 def fed(detector, t_s, values):
     charts = Charts(detector)
     levels = []
-    for at_s, value in zip(t_s, values, strict=True):
-        charts.update(at_s, value, waves(np.array([at_s]))[0])
+    for each in zip(t_s, values, waves(t_s), strict=True):
+        charts.update(*each)
         levels.append(charts.statistic)
     return charts, np.array(levels)
 
@@ -79,11 +79,11 @@ def test_statistics_of_the_reference_are_found(detector):
 
 
 def test_false_alarms_come_at_most_as_often_as_designed():
-    """Forty-five minutes of clean error, designed for one false alarm in three minutes."""
+    """Half an hour of clean error, designed for one false alarm in three minutes."""
     design = AlarmDesign(false_alarm_h=0.05)
     found = fit_detector([residual(300, 3)], design)
-    charts, _ = fed(found, *residual(2700, 4))
-    assert len(charts.alarms) <= 15
+    charts, _ = fed(found, *residual(1800, 4))
+    assert len(charts.alarms) <= 10
 
 
 @pytest.mark.parametrize(("shift_mm", "within_s"), [(1.0, 15.0), (0.5, 25.0)])
@@ -246,12 +246,12 @@ def jumps(seconds, seed, factor):
 def test_fast_moves_have_a_variance_of_their_own():
     """A model that errs three times as much in fast moves as its memory along the path states.
 
-    Ten minutes hold 30 of them, and forty minutes raise no alarm; larger errors in them do, and
+    Ten minutes hold 30 of them, and twenty minutes raise no alarm; larger errors in them do, and
     so would these without a variance of their own.
     """
     found, plain = (fit([jumps(600, 20, factor)], SPAN) for factor in (3.0, 1.0))
     assert np.median(found.whitening.fast) > 3.0 * np.median(plain.whitening.fast)
-    clean, changed = jumps(2400, 21, 3.0), jumps(600, 22, 12.0)
+    clean, changed = jumps(1200, 21, 3.0), jumps(600, 22, 12.0)
     blind = replace(found, whitening=replace(found.whitening, fast=plain.whitening.fast))
     for detector, stretch, alarms in (
         (found, clean, False),
@@ -261,7 +261,10 @@ def test_fast_moves_have_a_variance_of_their_own():
         charts = Charts(detector)
         for each in zip(*stretch, strict=True):
             charts.update(*each)
-        assert charts.judged > len(stretch.t_s) // 3, "of one block for two samples"
+            if charts.alarms:
+                break
+        ended = np.searchsorted(stretch.t_s, each[0])
+        assert charts.judged > ended // 3, "of one block for two samples"
         assert bool(charts.alarms) == alarms
 
 
@@ -354,8 +357,8 @@ def test_an_error_that_is_large_at_once_is_found_in_two_seconds(brief, moves):
     t_s, values = residual(124, 15, correlation_s=1.0)
     values[t_s >= 120.0] += 1.0
     charts = Charts(brief)
-    for at_s, value in zip(t_s, values, strict=True):
-        charts.update(at_s, value, waves(np.array([at_s if moves else min(at_s, 119.0)]))[0])
+    for each in zip(t_s, values, waves(t_s if moves else t_s.clip(max=119.0)), strict=True):
+        charts.update(*each)
     found = [alarm for alarm in charts.alarms if alarm.chart == "sudden"]
     assert len(found) == moves
     for alarm in found:

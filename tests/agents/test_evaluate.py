@@ -13,6 +13,7 @@ import pytest
 import torch
 from scipy.stats import binomtest, ttest_rel
 
+from surgisoft.agents import session
 from surgisoft.agents.evaluate import (
     Evaluation,
     cell,
@@ -24,7 +25,7 @@ from surgisoft.agents.evaluate import (
     wilson,
 )
 from surgisoft.agents.exact_checks import Contact, EpisodeCheck
-from surgisoft.agents.rollout import Rollout
+from surgisoft.agents.rollout import Rollout, rollout
 from surgisoft.agents.run_folder import PACKAGED, RunFolder
 from surgisoft.agents.session import EvaluationRequest, evaluate
 from surgisoft.cli import run
@@ -324,7 +325,7 @@ def test_a_policy_of_another_scene_is_warned_of(tmp_path):
 
 
 def test_a_beam_beyond_the_limits_of_its_scene_is_warned_of(tmp_path, capsys):
-    """The lengths are those of the beam in an episode of the expert, from 6 s to 12 s.
+    """The lengths are those of the beam in an episode of the expert, from 6 s to 9 s.
 
     No task enforces the limits: with the beam too short and too steep the episode is the same."""
     place = tmp_path / "strict"
@@ -338,7 +339,7 @@ def test_a_beam_beyond_the_limits_of_its_scene_is_warned_of(tmp_path, capsys):
     episodes, lengths = Episodes(task), []
     state = episodes.seeded(0, 4)
     with torch.inference_mode():
-        for step in range(120):
+        for step in range(90):
             state, _ = episodes.step(state, task.script(state))
             if step >= 60:
                 tip = state.world.arms["laser"].points_mm[:, -1]
@@ -395,11 +396,11 @@ def test_the_command_imports_nothing_of_pictures_and_training():
     """Matplotlib and Rerun, which only pages and replays need, and rsl-rl, which only training
     needs, take seconds to import; trimesh, which only meshes of others need, a quarter of one.
 
-    Of the episode 60 steps, in which the beam is on and a part of the ring is cut."""
+    Of the episode 40 steps, in which the beam is on and a part of the ring is cut."""
     code = (
         "import sys; from surgisoft.agents import session; whole = session.rollout; "
         "session.rollout = lambda task, *rest, **more: "
-        "(setattr(task, 'steps', 60), whole(task, *rest, **more))[1]; "
+        "(setattr(task, 'steps', 40), whole(task, *rest, **more))[1]; "
         "from surgisoft.cli import run; "
         "assert run('evaluate ring --episodes 1 --no-exact-checks'.split()) == 0; "
         "slow = {'matplotlib', 'rerun', 'rsl_rl', 'tensordict', 'torch', 'torch._dynamo', "
@@ -411,14 +412,23 @@ def test_the_command_imports_nothing_of_pictures_and_training():
 
 
 def test_the_block_of_the_page_drives_the_episodes_of_evaluate(tmp_path, monkeypatch):
-    """docs/evaluate.md as it stands: episodes 0 and 1 of seed 7, here of a faster ring."""
+    """docs/evaluate.md as it stands: episodes 0 and 1 of seed 7, here 90 steps of a faster ring."""
     page = (Path(__file__).parents[2] / "docs" / "evaluate.md").read_text()
     (block,) = re.findall(r"^```python\n(.*?)^```", page, re.S | re.M)
     packaged = RunFolder("ring")
     shutil.copytree(packaged.path, tmp_path / "runs" / "ring")
     quick = replace(packaged.plan().task_config, cut_s=10.0)
+
+    def brief(task):
+        task.steps = 90
+        return task
+
+    def rollout_of_brief(task, *given, **named):
+        return rollout(brief(task), *given, **named)
+
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(RunFolder, "task", lambda run: make_task("circle_ablation", quick))
+    monkeypatch.setattr(RunFolder, "task", lambda run: brief(make_task("circle_ablation", quick)))
+    monkeypatch.setattr(session, "rollout", rollout_of_brief)
     names = {}
     exec(block, names)
     found = evaluate("runs/ring", config=quick, episodes=2, seed=7, exact_checks=False)

@@ -17,11 +17,12 @@ from surgisoft.tasks.world.scene import ENDOSCOPE, SceneEngine
 AGREE_MM = 1e-4
 """Largest difference of a place (mm): rounding of float32 at 100 mm, some ten steps of it."""
 EPISODES = 2
-STEPS = {"breathing_ablation": 750}
-"""Longest stretch of an episode: 18 breaths of `breathing_ablation`, whose arms are those of all
-tasks with a scene; of these 300 steps, and the others as a whole."""
-LOOK_EVERY = 120
-"""Steps between two comparisons of the scenes, whose state follows from that of the arms."""
+MOST, WITH_SCENE, BREATHING = 300, 60, 400
+"""Longest stretches of an episode, steps: of a task without a scene, which is then whole; of one
+with a scene; of `breathing_ablation`, which are 10 breaths: its arms are those of all tasks with a
+scene."""
+LOOKS = 2
+"""Comparisons of the scenes in an episode, whose state follows from that of the arms."""
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -37,7 +38,9 @@ def test_compiled_arms_agree_with_the_reference_over_whole_episodes(name):
     with torch.inference_mode():
         world = Episodes(task).seeded(4, EPISODES).world
         stream, found, expected = world.stream, dict(world.arms), dict(world.arms)
-        for step in range(min(task.steps, STEPS.get(name, 300))):
+        most = MOST if around is None else BREATHING if name == "breathing_ablation" else WITH_SCENE
+        steps = min(task.steps, most)
+        for step in range(steps):
             for arm, body in plain.items():
                 action = torch.randn(EPISODES, body.chambers, generator=random)
                 _, expected[arm] = body.step(stream, expected[arm], action, dt_s)
@@ -46,7 +49,7 @@ def test_compiled_arms_agree_with_the_reference_over_whole_episodes(name):
                     off = (getattr(found[arm], field) - getattr(expected[arm], field)).abs().max()
                     assert off < AGREE_MM, (arm, field, step)
                 assert torch.equal(found[arm].arm.direction, expected[arm].arm.direction)
-            if others and step % LOOK_EVERY == 0:
+            if others and step % (steps // LOOKS) == 0:
                 stream, scene = around.start(stream, found)
                 for other in others:
                     assert_scenes_agree(around, other, replace(world, arms=found, scene=scene))

@@ -1,6 +1,7 @@
 """The reference of the tasks says what the environments do, and the docs hold it."""
 
 import dataclasses
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -17,12 +18,14 @@ PAGES = Path(__file__).resolve().parents[2] / "docs" / "environments"
 MOVED = ("direction", "reversal", "time")
 """Blocks that go through most of their range in any episode."""
 every_task = pytest.mark.parametrize("name", TASKS)
+task_of, told_of = cache(make_task), cache(describe)
+"""Tasks, which hold no state, and what is said of them, made once."""
 
 
 @every_task
 def test_blocks_cover_the_whole_observation_and_terms_the_whole_reward(name):
-    task = make_task(name)
-    adapter, told = NumpyAdapter(task), describe(name)
+    task = task_of(name)
+    adapter, told = NumpyAdapter(task), told_of(name)
     assert tuple(told.agents) == task.agents == TASKS[name].agents
     _, outcome = adapter.step(
         adapter.seeded([0]), {agent: torch.zeros(1, 3).numpy() for agent in task.agents}
@@ -80,7 +83,7 @@ def test_every_randomised_quantity_is_listed():
 @every_task
 def test_summaries_and_ends_are_whole_sentences(name):
     """A docstring's first sentence may go on in its second line."""
-    told = describe(name)
+    told = told_of(name)
     assert told.summary.endswith(".")
     assert told.ends.endswith(".")
     assert "\n" not in told.summary + told.ends
@@ -111,7 +114,7 @@ def test_the_check_names_pages_that_differ(tmp_path, capsys, monkeypatch):
 @every_task
 def test_observations_lie_in_the_stated_ranges(name):
     """Over random episodes from their start to their end, and steps of the scripted expert."""
-    task = make_task(name)
+    task = task_of(name)
     play, stated = Episodes(task), describe_agents(task)
     torch.manual_seed(0)
     seen = {agent: [] for agent in task.agents}

@@ -88,7 +88,7 @@ def test_a_weak_laser_is_told_with_the_dose_and_the_threshold():
 
 def test_the_share_of_an_area_is_that_of_the_expert():
     """Lines 3 mm apart with a spot of 2 mm: strips between them stay below the dose."""
-    task = AreaAblation(AreaAblationConfig(outlines=SPOT, pitch_mm=3.0, time_s=12.0))
+    task = AreaAblation(AreaAblationConfig(outlines=SPOT, pitch_mm=3.0, time_s=9.0))
     found = reference_dose(task)
     episodes = Episodes(task)
     state = episodes.seeded(0, 2)
@@ -148,7 +148,7 @@ def test_the_commands_warn_of_a_weak_laser(tmp_path, capsys):
     assert [line.split("'")[1] for line in said] == ["weak"]
 
     told = []
-    config = CircleAblationConfig(scene=place, world=WorldConfig(dt_s=1.0))
+    config = CircleAblationConfig(scene=place, world=WorldConfig(dt_s=5.0))
     evaluate("random", "circle_ablation", config=config, episodes=1, exact_checks=False,
              on_warning=told.append)  # fmt: skip
     assert told == [weak_laser(CircleAblation(config))]

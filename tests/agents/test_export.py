@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -72,6 +73,8 @@ STRANGE = RigConfig(seed=1, settle_s=0.3, noise=0.0)
 """Another robot than the one that the model was fitted to. Without noise its pressure sensors read
 without steps. With steps of 0.02 kPa a command that differs by 1e-6 kPa can change a reading of the
 pumps' controllers, and moves the body by up to 7e-4 mm until the next reading (`laser_plane`)."""
+
+STRANGE_WITH_NOISE = replace(STRANGE, noise=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -218,8 +221,7 @@ def ring():
     policy = LearnedPolicy("ring")
     config = replace(policy.run.plan().task_config, cut_s=12.0)
     task = make_task(policy.run.config["task"], config)
-    config = replace(STRANGE, noise=1.0)
-    return policy, task, drive(task, policy, config, build=ten_pictures_a_second)
+    return policy, task, drive(task, policy, STRANGE_WITH_NOISE, build=ten_pictures_a_second)
 
 
 def test_the_example_of_the_page_drives_the_controller(ring, monkeypatch):
@@ -318,26 +320,31 @@ class Moved:
         return {name: value + self.later_kPa for name, value in command.items()}
 
 
-@pytest.mark.parametrize("later_kPa", [0.0, 0.002])
-def test_a_loop_that_departs_by_rounding_passes_and_one_by_a_wrong_controller_does_not(
-    ring, later_kPa
-):
+def test_a_loop_that_departs_by_rounding_passes_and_one_by_a_wrong_controller_does_not(ring):
     """One set point of 10^-6 kPa more: after a whole ring the endoscope is 0.02 mm away or more,
-    although at every decision the controller computes what the policy computes."""
+    although at every decision the controller computes what the policy computes. A controller whose
+    later commands are wrong is told within 20 decisions."""
     policy, task, episode = ring
-    controller = running(ControllerGraph(task, policy.actors))
-    moved = Moved(controller, first_kPa=1e-6, later_kPa=later_kPa)
-    closed, rigs = closed_loop(moved, episode, ten_pictures_a_second)
-    assert closed.points_mm > 200.0 * TOLERANCE_MM
-    build = replaying(rigs, ten_pictures_a_second)
-    beside = drive(task, policy, replace(STRANGE, noise=1.0), build=build)
-    pressures, points = beside.measured(row := beside.settled + 100)
-    for name, rig in rigs.items():
-        np.testing.assert_array_equal(pressures[name], rig.samples[row][0].measured)
-        np.testing.assert_array_equal(points[name], rig.samples[row][0].key_points_mm)
-    own = same_measurements(moved, beside)
-    assert RigCheck(Differences(0.0, 0.0), closed, episode.decisions, own).passed == (not later_kPa)
-    assert own.commands_kPa == pytest.approx(later_kPa, abs=TOLERANCE_KPA)
+    for later_kPa in (0.0, 0.002):
+        if later_kPa:
+            task = copy(task)
+            task.steps = 20
+            episode = drive(task, policy, STRANGE_WITH_NOISE, build=ten_pictures_a_second)
+        controller = running(ControllerGraph(task, policy.actors))
+        moved = Moved(controller, first_kPa=1e-6, later_kPa=later_kPa)
+        closed, rigs = closed_loop(moved, episode, ten_pictures_a_second)
+        assert closed.points_mm > (1.0 if later_kPa else 200.0) * TOLERANCE_MM
+        build = replaying(rigs, ten_pictures_a_second)
+        beside = drive(task, policy, STRANGE_WITH_NOISE, build=build)
+        assert beside.decisions == episode.decisions
+        pressures, points = beside.measured(row := beside.settled + 15)
+        for name, rig in rigs.items():
+            np.testing.assert_array_equal(pressures[name], rig.samples[row][0].measured)
+            np.testing.assert_array_equal(points[name], rig.samples[row][0].key_points_mm)
+        own = same_measurements(moved, beside)
+        check = RigCheck(Differences(0.0, 0.0), closed, episode.decisions, own)
+        assert check.passed == (not later_kPa)
+        assert own.commands_kPa == pytest.approx(later_kPa, abs=TOLERANCE_KPA)
 
 
 def wrong_files(monkeypatch, off, wrong):

@@ -15,6 +15,7 @@ import torch
 from surgisoft.cli import run as surgisoft
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import save_recording
+from surgisoft.surrogate import export as exporting
 from surgisoft.surrogate.callables import named
 from surgisoft.surrogate.callables.arm import arm_by_itself
 from surgisoft.surrogate.callables.named import named_callable
@@ -130,6 +131,8 @@ def built(bench, tmp_path_factory):  # noqa: F811
     They are exported once.
     """
     place = tmp_path_factory.mktemp("built")
+    monkeypatch = pytest.MonkeyPatch()
+    monkeypatch.setattr(exporting, "CHECKED", 30)  # the recording has 80 rows more
 
     def copied(name, folder="arm"):
         model = wrapped(name, BUILT[name])
@@ -139,7 +142,8 @@ def built(bench, tmp_path_factory):  # noqa: F811
         shutil.copytree(place / name, folder)
         return model
 
-    return copied
+    yield copied
+    monkeypatch.undo()
 
 
 def predicted(recording, folder, *arguments):

@@ -1,7 +1,7 @@
 """What a CUDA graph records of a world may not send a GPU anything, nor read a value back."""
 
+import inspect
 import linecache
-import sys
 
 import pytest
 import torch
@@ -40,7 +40,7 @@ class Recordable(TorchFunctionMode):
             keys = args[1] if isinstance(args[1], tuple) else (args[1],)
             sent = any(isinstance(key, list) for key in keys)
         if sent or func in READS:
-            frame = sys._getframe(1)
+            frame = inspect.currentframe()
             while "surgisoft/" not in frame.f_code.co_filename:
                 frame = frame.f_back
             file = frame.f_code.co_filename

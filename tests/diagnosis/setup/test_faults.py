@@ -12,6 +12,8 @@ from surgisoft.diagnosis.setup import find_setup_faults, find_small_frame
 from surgisoft.diagnosis.setup.arrangements import mistaken
 from surgisoft.diagnosis.setup.sample import samples_of
 from surgisoft.diagnosis.setup.search import Levels, Proof, Search
+from surgisoft.surrogate.checkpoint import default_arm
+from tests.diagnosis.setup import recordings
 from tests.diagnosis.setup.recordings import (
     NOISE_MM,
     STEP_S,
@@ -226,9 +228,15 @@ PHYSICS = {
 }
 
 
+CLOSE = ("a lag of 0.25 s", "a gain that is between those of two units")
+"""Physics that is nearly a fault: only the default arm in four minutes shows an error of a search
+that takes it for one."""
+
+
 @pytest.mark.parametrize("name", PHYSICS)
 def test_physics_is_no_fault_of_the_set_up(model, name):
-    assert find_setup_faults(model, [PHYSICS[name](measured(ROWS))]) is None
+    arm, made = (default_arm(), recordings.measured()) if name in CLOSE else (model, measured(ROWS))
+    assert find_setup_faults(arm, [PHYSICS[name](made)]) is None
 
 
 def test_one_of_two_recordings_with_a_turned_frame(model):

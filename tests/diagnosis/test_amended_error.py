@@ -13,8 +13,8 @@ from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.training import validated_error
-from tests.diagnosis.few_effects import choose_among
 from tests.diagnosis.test_estimation import NOISE_MM, TRUTHS, bare_arm, measured_on
+from tests.few_effects import choose_among
 
 FLOOR_MM = np.sqrt(3.0) * NOISE_MM
 

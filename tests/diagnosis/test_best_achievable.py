@@ -14,7 +14,6 @@ from surgisoft.diagnosis.selection import best_achievable
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import load_model
-from tests.diagnosis.few_effects import choose_among
 from tests.diagnosis.synthetic import (
     NOISE_MM,
     backlash,
@@ -24,6 +23,7 @@ from tests.diagnosis.synthetic import (
     still_model,
     walk,
 )
+from tests.few_effects import choose_among
 
 ROWS = 2000
 FLOOR = np.sqrt(3) * NOISE_MM

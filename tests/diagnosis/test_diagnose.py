@@ -30,7 +30,7 @@ from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, load_model, load_training_residuals
 from surgisoft.surrogate.effects import make_effect
 from surgisoft.surrogate.effects.contact import LEAST_SHARE
-from tests.diagnosis.few_effects import all_but
+from tests.few_effects import all_but
 
 FEW = ("gain_mismatch", "hysteresis", "creep", "payload", "misalignment")
 """Effects of every stage, among which a diagnosis chooses where the others are not tested."""

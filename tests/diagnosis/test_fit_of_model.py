@@ -14,10 +14,10 @@ from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.surrogate.checkpoint import default_arm
 from surgisoft.surrogate.model import Validation
-from tests.diagnosis.few_effects import choose_among
 from tests.diagnosis.setup.recordings import NOISE_MM, measured, predicted, with_points
 from tests.diagnosis.synthetic import recording, still_model, walk
 from tests.diagnosis.test_estimation import bare_arm, measured_on
+from tests.few_effects import choose_among
 
 
 @pytest.fixture(scope="module")

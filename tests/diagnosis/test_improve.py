@@ -28,10 +28,10 @@ from surgisoft.measurement.recordings import save_recording
 from surgisoft.report import Text
 from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.model import ArmModel
-from tests.diagnosis.few_effects import choose_among
 from tests.diagnosis.synthetic import NOISE_MM
 from tests.diagnosis.test_estimation import TRUTHS, bare_arm, measured_on, with_truth
 from tests.diagnosis.test_estimation import rms as rms_distance
+from tests.few_effects import choose_among
 
 
 def said(kind: str, *effects: str) -> Diagnosis:

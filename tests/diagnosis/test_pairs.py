@@ -51,8 +51,8 @@ from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, save_model
 from surgisoft.surrogate.model import Validation
 from surgisoft.surrogate.training_residuals import Past
-from tests.diagnosis.few_effects import choose_among
 from tests.diagnosis.synthetic import NOISE_MM, PERIOD_S, POINTS, recording, still_model, walk
+from tests.few_effects import choose_among
 
 ROWS = 2400
 SMOOTHNESS = 25

@@ -50,7 +50,7 @@ from surgisoft.measurement.recordings import Recording, save_recording
 from surgisoft.surrogate.checkpoint import save_model
 from surgisoft.surrogate.effects import Memoryless, known_effects, make_effect
 from surgisoft.surrogate.model import ArmModel, Validation
-from tests.diagnosis.few_effects import all_but, choose_among
+from tests.few_effects import all_but, choose_among
 
 PERIOD_S, LAG_S, NOISE_MM = 0.1, 0.4, 0.1
 SHORT = RefitConfig(rows=800, seeds=2, early_epochs=1, first_epochs=2, epochs=3, finalists=2)

@@ -17,9 +17,9 @@ from surgisoft.measurement.recordings import Recording
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm
 from surgisoft.surrogate.model import ArmModel
-from tests.diagnosis.few_effects import choose_among
 from tests.diagnosis.synthetic import recording as synthetic_recording
 from tests.diagnosis.synthetic import resting_together, still_model
+from tests.few_effects import choose_among
 
 
 @pytest.fixture(scope="module")

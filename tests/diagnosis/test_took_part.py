@@ -22,7 +22,7 @@ from surgisoft.report import write_page
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.fitted_rows import FittedRows
-from tests.diagnosis.few_effects import choose_among
+from tests.few_effects import choose_among
 
 
 @pytest.fixture(autouse=True)

@@ -768,7 +768,7 @@ def test_a_second_effect_of_a_kind_is_added_where_the_present_one_fitted_anew_le
     form = {"radii": FEW_RADII, "ring": True, "pairs": False}
     weights = 0.05 * torch.eye(3, len(FEW_RADII)).flip(1)
     truth = with_truth("hysteresis", {"turned": weights}, arm, **form)
-    problem = problem_of(arm, [measured_on(truth, rows=150)])
+    problem = problem_of(arm, [measured_on(truth, rows=300)])
     fitted = fit_effects(problem, ["hysteresis"], more=["hysteresis"] if more else [])
     left = rms(problem.with_model(fitted.model).residual)
     if more:

@@ -26,7 +26,7 @@ LOOKS = 2
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_compiled_arms_agree_with_the_reference_over_whole_episodes(name):
+def test_compiled_arms_agree_with_the_reference_over_episodes(name):
     task, random = make_task(name), torch.Generator().manual_seed(1)
     plain = {arm: body.reference() for arm, body in task.world.arms.items()}
     around, others, dt_s = task.world.scene, [], task.world.config.dt_s

@@ -491,7 +491,7 @@ def test_a_command_leaves_the_function_of_commands_in_place(capsys):
     assert capsys.readouterr().err.count("nowhere.parquet") >= 2
 
 
-def test_a_recording_that_is_there_is_refused_before_the_rig_moves(tmp_path, monkeypatch):
+def test_a_recording_that_is_there_is_refused_before_the_rig_moves(tmp_path, monkeypatch, capsys):
     def moved(*_, **__):
         raise AssertionError("the rig was driven")
 
@@ -499,6 +499,7 @@ def test_a_recording_that_is_there_is_refused_before_the_rig_moves(tmp_path, mon
     there = tmp_path / "r.csv"
     there.write_text("x")
     assert run(["collect", "holds", "-o", str(there)]) == 2
+    assert f"{there}: exists already" in capsys.readouterr().err
     assert there.read_text() == "x"
 
 

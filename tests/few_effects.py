@@ -1,7 +1,7 @@
 """Fewer effects, for tests in which a few will do.
 
-A diagnosis and a comparison try every known effect, and every pair of two: with a third of them
-they take a fraction of the time.
+A diagnosis tries every known effect and every pair of effects, a comparison every effect: with a
+third of the effects they take a fraction of the time.
 """
 
 from collections.abc import Iterator
@@ -34,7 +34,7 @@ def choose_among(patch: pytest.MonkeyPatch, *effects: str) -> None:
 
 @contextmanager
 def few_effects(*names: str) -> Iterator[None]:
-    """Inside the block the package has these effects alone, and hysteresis, which its arm has.
+    """Inside the block, the package has these effects and hysteresis, which the default arm has.
 
     For whole commands, and programs that start them in this process.
     """

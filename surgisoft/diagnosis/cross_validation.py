@@ -366,9 +366,9 @@ class CrossValidation:
     ) -> np.ndarray:
         """(N, B) `losses` of each of N sets of sensitivities.
 
-        common: for each set those of it that other sets have, too; None: none. Sets of few
-        sensitivities take less time to solve than a call from Python, so those that were not tried
-        yet are solved in one call.
+        Solving a set of few sensitivities takes less time than a call from Python. So all sets that
+        were not tried yet are solved in one call. common: for each set, the sensitivities that it
+        shares with other sets; None: none.
         """
         found = [_rising(each) for each in sets]
         shared = [()] * len(sets) if common is None else common

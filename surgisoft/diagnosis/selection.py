@@ -613,8 +613,8 @@ def _together(
     sets: Sequence[tuple[int, ...]],
     common: Sequence[tuple[int, ...]] | None = None,
 ) -> list[float]:
-    """How well sets of sensitivities explain: mean log gain of the blocks plus log gain of the
-    whole error.
+    """How well each of some sets of sensitivities explains the error: mean log gain of the blocks
+    plus log gain of the whole error.
 
     Few blocks that fall by much and many that fall by little both count. The noise is added to
     both, and amplitudes have their price. common: as of `CrossValidation.losses_of`.

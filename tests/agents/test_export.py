@@ -75,6 +75,7 @@ without steps. With steps of 0.02 kPa a command that differs by 1e-6 kPa can cha
 pumps' controllers, and moves the body by up to 7e-4 mm until the next reading (`laser_plane`)."""
 
 STRANGE_WITH_NOISE = replace(STRANGE, noise=1.0)
+"""The same robot with the noise of its cameras and pressure sensors."""
 
 
 @pytest.fixture(scope="module")
